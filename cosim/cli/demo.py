@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
+import typer
+
 from cosim.cli import output as cli
 
 SCENARIO = "fouled"
@@ -18,9 +20,7 @@ RUNS = 10
 
 
 def demo(
-    samples: Annotated[
-        int, cli.count("--samples", least=1000, most=1_000_000, text="Plant samples of learning.")
-    ] = 20_000,
+    samples: Annotated[int, typer.Option(min=1000, max=1_000_000)] = 20_000,
     steps: cli.StepsOption = 500,
     seed: cli.SeedOption = 0,
     out: cli.OutOption = Path("cosim-demo"),
@@ -31,6 +31,9 @@ def demo(
     The condenser of the evaporator is fouled and no controller is told. Writes
     evaluation.csv, evaluation.png, timing.csv, summary.json, before-after.png, demo.rrd, and of the
     training learning.csv, learning.png, training.rrd, parameters.toml and scenario.toml.
+
+    Args:
+        samples: Plant samples of learning.
     """
     with cli.output(json) as out_:
         from cosim.cli.evaluate import show

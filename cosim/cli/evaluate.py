@@ -16,30 +16,13 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    controllers: Annotated[
-        list[str],
-        typer.Option(
-            "--controllers",
-            "-c",
-            help="Comma-separated, or the option again: naive, tuned, commissioned, cautious, lqr, "
-            "pi, converged, optimal, a parameters file or module:factory; NAME=… gives one another "
-            "name.",
-        ),
-    ] = ["naive"],  # noqa: B006
+    controllers: Annotated[list[str], typer.Option("--controllers", "-c")] = ["naive"],  # noqa: B006
     scenario: cli.ScenarioOption = "paper",
-    seeds: Annotated[int, cli.count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
-    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
+    seeds: Annotated[int, typer.Option(min=1, max=1_000_000)] = 10,
+    first_seed: Annotated[int, typer.Option(min=0)] = 0,
     steps: cli.StepsOption = 1000,
     out: cli.OutOption = Path("cosim-evaluation"),
-    trajectories: Annotated[
-        Path | None,
-        typer.Option(
-            "--trajectories",
-            help="In place of controllers: judge a folder of loops that another tool ran, one CSV "
-            "file a seed (run-7.csv) with the states and the actions applied.",
-            show_default=False,
-        ),
-    ] = None,
+    trajectories: Path | None = None,
     jobs: cli.JobsOption = None,
     scheduler: cli.SchedulerOption = None,
     json: cli.JsonOption = False,
@@ -48,6 +31,15 @@ def evaluate(
 
     Writes evaluation.csv (a row per controller and seed), evaluation.png, summary.json, timing.csv
     and scenario.toml. Run again with the same --out to go on after an interruption.
+
+    Args:
+        controllers: Comma-separated, or the option again: naive, tuned, commissioned, cautious,
+            lqr, pi, converged, optimal, a parameters file or module:factory; NAME=… gives one
+            another name.
+        seeds: Number of seeds.
+        first_seed: The first seed.
+        trajectories: In place of controllers: judge a folder of loops that another tool ran, one
+            CSV file a seed (run-7.csv) with the states and the actions applied.
     """
     with cli.output(json) as out_:
         from loky import cpu_count

@@ -18,16 +18,8 @@ if TYPE_CHECKING:
 
 def optimum(
     scenario: cli.ScenarioOption = "paper",
-    refine: Annotated[
-        bool,
-        typer.Option(
-            "--refine",
-            help="Solve, refine the grid, simulate the policy; keep the certificate.",
-        ),
-    ] = False,
-    recompute: Annotated[
-        bool, typer.Option("--recompute", help="Solve even if the policy is stored.")
-    ] = False,
+    refine: Annotated[bool, typer.Option("--refine")] = False,
+    recompute: Annotated[bool, typer.Option("--recompute")] = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Mean cost per sample J* of the optimal policy, by dynamic programming, with its bounds.
@@ -36,6 +28,10 @@ def optimum(
     refinement and long simulation agree within 0.05 % and no policy search is below; else
     it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
     A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is.
+
+    Args:
+        refine: Solve, refine the grid, simulate the policy; keep the certificate.
+        recompute: Solve even if the policy is stored.
     """
     with cli.output(json) as out_:
         from controllers.optimum import QuasiStaticPolicy, change_of
@@ -115,15 +111,16 @@ def _told(out_: cli.Output) -> Progress:
 
 def tuning(
     scenario: cli.ScenarioOption = "paper",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Write the tuned θ to this TOML file.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Tune the NMPC's cost by economics (controller `tuned`) and show the certificate.
 
     It says which constraint enters, the eigenvalues of the economic and of the convexified
     cost's Hessian, and the local feedback gain of both.
+
+    Args:
+        out: Write the tuned θ to this TOML file.
     """
     with cli.output(json) as out_:
         from controllers.economic import tune

@@ -24,9 +24,9 @@ MOST = 100_000_000
 """Samples of the longest run."""
 
 
-def count(*names: str, least: int = 1, most: int = MOST, text: str) -> Any:
-    """An option that is a number of samples, or of something else."""
-    return typer.Option(*names, min=least, max=most, help=text)
+def count(*names: str, text: str | None = None) -> Any:
+    """An option that is a number of samples."""
+    return typer.Option(*names, min=1, max=MOST, help=text)
 
 
 ScenarioOption = Annotated[
@@ -38,7 +38,8 @@ SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the dist
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")]
 RecordOption = Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")]
 JobsOption = Annotated[
-    int | None, count("--jobs", "-j", most=1024, text="Processes; default: one per core.")
+    int | None,
+    typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
 ]
 SchedulerOption = Annotated[
     str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs.")

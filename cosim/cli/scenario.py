@@ -33,21 +33,16 @@ app = typer.Typer(
 
 @app.command()
 def show(
-    name: Annotated[
-        str | None, typer.Argument(help="Preset, random-SEED or TOML file; none lists the presets.")
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(
-            "--seed-values",
-            min=0,
-            help="Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.",
-            show_default=False,
-        ),
-    ] = None,
+    name: Annotated[str | None, typer.Argument()] = None,
+    seed: Annotated[int | None, typer.Option("--seed-values", min=0)] = None,
     json: cli.JsonOption = False,
 ) -> None:
-    """List the presets, or print a scenario with every field written out, as TOML."""
+    """List the presets, or print a scenario with every field written out, as TOML.
+
+    Args:
+        name: Preset, random-SEED or TOML file; none lists the presets.
+        seed: Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.
+    """
     with cli.output(json) as out_:
         from cosim.scenario import Scenario, presets
 
@@ -81,26 +76,15 @@ def _seed_values(scenario: Scenario, seed: int) -> dict[str, float | bool | int]
 
 @app.command()
 def init(
-    fmu: Annotated[str, typer.Argument(help="FMU: a path, or evaporator.", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File; default: the FMU's name, .toml.")
-    ] = None,
-    states: Annotated[str, typer.Option("--states", help="Names, comma-separated.")] = "",
-    actions: Annotated[str, typer.Option("--actions", help="Names, comma-separated.")] = "",
-    cost: Annotated[
-        str | None, typer.Option("--cost", help="Output that is the stage cost.")
-    ] = None,
-    sampling_time: Annotated[
-        float | None,
-        typer.Option("--sampling-time", min=1e-9, max=1e12, help="Sampling time in s."),
-    ] = None,
-    state: Annotated[
-        str, typer.Option("--state", help="Where to look for the steady state: numbers.")
-    ] = "",
-    action: Annotated[str, typer.Option("--action", help="The same of the actions.")] = "",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the file if it is there.")
-    ] = False,
+    fmu: str,
+    out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
+    states: str = "",
+    actions: str = "",
+    cost: str | None = None,
+    sampling_time: Annotated[float | None, typer.Option(min=1e-9, max=1e12)] = None,
+    state: str = "",
+    action: str = "",
+    overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Draft a scenario for an FMU: a commented TOML file, to be read and corrected.
@@ -108,6 +92,17 @@ def init(
     States, actions, cost, noise, ranges and what a reset can write are guessed from
     modelDescription.xml; the steady state near the start values is found by stepping the FMU,
     whose native code this runs.
+
+    Args:
+        fmu: FMU: a path, or evaporator.
+        out: File; default: the FMU's name, .toml.
+        states: Names, comma-separated.
+        actions: Names, comma-separated.
+        cost: Output that is the stage cost.
+        sampling_time: Sampling time in s.
+        state: Where to look for the steady state: numbers.
+        action: The same of the actions.
+        overwrite: Replace the file if it is there.
     """
     with cli.output(json) as out_:
         from cosim.errors import CosimError

@@ -16,15 +16,7 @@ DRAWN = 20_000
 
 def simulate(
     scenario: cli.ScenarioOption = "paper",
-    controller: Annotated[
-        str,
-        typer.Option(
-            "--controller",
-            "-c",
-            help="naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters "
-            "file, or module:factory.",
-        ),
-    ] = "naive",
+    controller: Annotated[str, typer.Option("--controller", "-c")] = "naive",
     steps: cli.StepsOption = 1000,
     seed: cli.SeedOption = 0,
     out: cli.OutOption = Path("cosim-run"),
@@ -37,6 +29,10 @@ def simulate(
     summary.json, scenario.toml and, with --record, run.rrd.
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
+
+    Args:
+        controller: naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters
+            file, or module:factory.
     """
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

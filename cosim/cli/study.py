@@ -16,15 +16,6 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 results = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
 
-ColumnsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--columns",
-        help="Columns of the printed tables, by comma, or `all`: case, rank, samples, finished, "
-        "regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against, difference, "
-        "p; default: case,rank,regret,worst,finished.",
-    ),
-]
 FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 NamesArgument = Annotated[
     list[str] | None, typer.Argument(help="Studies; default: all that apply.")
@@ -114,13 +105,19 @@ def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
 
 @app.command()
 def report(
-    folder: Annotated[Path, typer.Argument(help="Folder of a study.", show_default=False)],
-    columns: ColumnsOption = None,
+    folder: Path,
+    columns: str | None = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
 
     Of an unfinished study the finished runs are reported; a stored study may be reported, too.
+
+    Args:
+        folder: Folder of a study.
+        columns: Columns of the printed tables, by comma, or `all`: case, rank, samples, finished,
+            regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against,
+            difference, p; default: case,rank,regret,worst,finished.
     """
     with cli.output(json) as out_:
         from cosim.studies.results import StudyResults
@@ -155,12 +152,7 @@ def _show(found: StudyResults, out_: cli.Output, columns: str | None = None) -> 
 
 
 def reproduce(
-    budget: Annotated[
-        Literal["quick", "full"],
-        typer.Option(
-            "--budget", help="quick: minutes on 2 cores; full: hours, with more seeds and samples."
-        ),
-    ] = "quick",
+    budget: Literal["quick", "full"] = "quick",
     out: cli.OutOption = Path("cosim-reproduction"),
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
@@ -170,6 +162,9 @@ def reproduce(
     A study (results/reproduce.toml, results/reproduce-full.toml): writes report.html and report.md
     with the paper's comparison at each reading of its open points and the paper's figure, and the
     tables of `cosim study run`. Run again with the same --out to go on after an interruption.
+
+    Args:
+        budget: quick: minutes on 2 cores; full: hours, with more seeds and samples.
     """
     with cli.output(json) as out_:
         from cosim.studies.stored import stored_results
@@ -186,15 +181,7 @@ def reproduce(
 @results.command()
 def check(
     names: NamesArgument = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            "--results",
-            help="Folder with the studies and tolerances.toml; default: ./results, else the "
-            "installed ones.",
-            show_default=False,
-        ),
-    ] = None,
+    folder: Annotated[Path | None, typer.Option("--results")] = None,
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
@@ -202,6 +189,10 @@ def check(
 
     Exit code 1 where a signal differs by more than its tolerance, with the first row that differs;
     2 where a stored table is missing or damaged. Writes nothing.
+
+    Args:
+        folder: Folder with the studies and tolerances.toml; default: ./results, else the installed
+            ones.
     """
     with cli.output(json) as out_:
         from cosim.files import temporary_folder
@@ -233,15 +224,16 @@ def check(
 @results.command()
 def update(
     names: NamesArgument = None,
-    folder: Annotated[
-        Path, typer.Option("--results", help="Folder with the studies and tolerances.toml.")
-    ] = Path("results"),
+    folder: Annotated[Path, typer.Option("--results")] = Path("results"),
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Run studies and store their tables, figures and reports, and the folder's README.
 
     What long studies have finished is kept in the folder's `.work`; run again to go on.
+
+    Args:
+        folder: Folder with the studies and tolerances.toml.
     """
     with cli.output(json) as out_:
         from cosim.studies import stored

@@ -37,7 +37,6 @@ from cosim.studies.run import (
     Noise,
     Report,
     Run,
-    RunKey,
     Runner,
     to_csv,
 )
@@ -120,7 +119,7 @@ def evaluate(
             "controller": item if isinstance(item, str) else _qualified(item),
             "parameters": parameters[name],
         }
-        runs.append(Run(RunKey(scenario.name, name), scenario, item, None, depends, noise))
+        runs.append(Run(scenario, name, depends, noise, item))
     total = sum(run.samples for run in runs)
     bar = reporting(progress, scenario.name, total)
     with temporary_folder("cosim-evaluation-") as own, bar as tell:

@@ -91,7 +91,7 @@ def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
 
         planned = plan(Study.load(file))
         runs = pd.DataFrame(
-            [(run.key.scenario, run.key.case, 1, run.samples) for run in planned.runs],
+            [(run.scenario.name, run.case, 1, run.samples) for run in planned.runs],
             columns=["scenario", "case", "runs", "plant samples"],
         )
         rows = runs.groupby(["scenario", "case"], sort=False, as_index=False).sum()

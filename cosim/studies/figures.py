@@ -215,9 +215,9 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
     for name, scenario in plan.definition.scenarios.items():
         for table in plan.definition.table.trajectory:
             runs = {
-                run.key.case: run
+                run.case: run
                 for run in plan.runs
-                if run.key.scenario == name and (out / run.kept.get(table.file, "?")).is_file()
+                if run.scenario.name == name and (out / run.kept.get(table.file, "?")).is_file()
             }
             found = {
                 case: replace(read_csv(out / run.kept[table.file], scenario), controller=case)
@@ -374,7 +374,7 @@ def _policy(run: Run, out: Path) -> Policy:
     controller: Controller = (
         build_controller(run.controller, run.scenario)
         if run.training is None
-        else run.training.controller((out / run.key.folder / PARAMETERS).read_text("utf-8"))
+        else run.learnt((out / run.folder / PARAMETERS).read_text("utf-8"))
     )
 
     def act(s: Array) -> Array:

@@ -23,14 +23,12 @@ from cosim.studies.run import (
     PARAMETERS,
     Noise,
     Run,
-    RunKey,
-    TrainingTask,
     safe,
 )
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training import HELD_OUT
+from learning.training import HELD_OUT, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS = "trajectories", "logs"
@@ -264,8 +262,8 @@ class Study:
             raise StudyError(f"{field}: has no number for '{scenario}', and no '{DEFAULT}'")
         return number
 
-    def training(self, case: Case, scenario: str, seed: int) -> TrainingTask:
-        """The training of a case on a scenario with one seed; raises ConfigurationError."""
+    def training(self, case: Case, scenario: str, seed: int) -> dict[str, Any]:
+        """The `training` of a case's run on a scenario; raises ConfigurationError."""
         assert case.algorithm is not None
         curves, samples = self.held_out(scenario), case.samples
         if marks := self.marks(scenario):
@@ -290,8 +288,8 @@ class Study:
             "evaluation_steps": curves.steps,
             **case.training,
         }
-        described, settings = self.scenarios[scenario], dict(case.settings)
-        return TrainingTask(case.algorithm, described, samples, settings, options)
+        found = {"algorithm": case.algorithm, "samples": samples}
+        return found | {"settings": dict(case.settings), "options": options}
 
 
 @dataclass(frozen=True)
@@ -331,19 +329,15 @@ def plan(study: Study) -> Plan:
             if ":" in (case.controller or ""):
                 build_controller(case.target, scenario)
             if training is not None:
-                training.prepare()
+                prepare(scenario=scenario, **training)
             parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
             depends[case.name, name] = depends_on(scenario, *parts)
         facts: dict[str, Any] = {**depends[case.name, name], "fmu": plants[name]["fmu"]}
         if training is None:
             facts["controller"] = study.relative(case.controller or "")
         else:
-            facts["training"] = {
-                "algorithm": training.algorithm,
-                "samples": training.samples,
-                "settings": training.settings,
-                "options": {**training.options, "start": study.relative(case.start)},
-            }
+            options = training["options"] | {"start": study.relative(case.start)}
+            facts["training"] = training | {"options": options}
         judged = training is not None or case.name == study.optima.get(name)
         marks = study.marks(name) if judged else ()
         noise = {EVALUATION: (own := study.noise(name))}
@@ -369,8 +363,8 @@ def plan(study: Study) -> Plan:
         seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
         if training is None and seeds:  # the optimum, on the noise of the training seeds
             noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
-        key = RunKey(name, case.name, seed)
-        runs.append(Run(key, scenario, case.controller, training, facts, noise, kept, marks))
+        run = Run(scenario, case.name, facts, noise, case.controller, seed, training, kept, marks)
+        runs.append(run)
     _check_names(study)
     about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})

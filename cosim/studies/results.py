@@ -127,11 +127,11 @@ class StudyResults(Shown):
         cases = [case.name for case in planned.definition.all_cases]
         places = {key: i for i, key in enumerate(product(planned.definition.scenarios, cases))}
         runs = [store for store in stores if store.sealed]  # by training seed
-        runs.sort(key=lambda store: places[store.run.key.scenario, store.run.key.case])
+        runs.sort(key=lambda store: places[store.run.scenario.name, store.run.case])
         found = cls(out, document(planned), *_frames(runs))
         for run in planned.runs:
             for name, target in run.kept.items():
-                if (source := out / run.key.folder / name).is_file():
+                if (source := out / run.folder / name).is_file():
                     (out / target).parent.mkdir(parents=True, exist_ok=True)
                     write_atomically(out / target, source.read_bytes())
         drawn = figures.draw(planned, out) if draw else []
@@ -605,7 +605,7 @@ def _frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:
     states, evaluations, curves = [], [], []
     for store in stores:
         run, about = store.run, store.about
-        key = dict(zip(KEYS, (run.key.scenario, run.key.case, run.key.seed), strict=True))
+        key = dict(zip(KEYS, (run.scenario.name, run.case, run.seed), strict=True))
         counts = {name: int(about.get(name, 0)) for name in ("samples", "plant_samples")}
         states.append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
         rows = store.measured(EVALUATION).rename_axis("seed").reset_index()
@@ -630,18 +630,18 @@ def _lives(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     alive, greedy = [], []
     for store in stores:
-        run, key = store.run, store.run.key
-        names, online = {"scenario": key.scenario, "case": key.case}, []
+        run, online = store.run, []
+        names = {"scenario": run.scenario.name, "case": run.case}
         for file, noise in run.noise.items():
             if noise.mark:
                 rows = store.measured(file).rename_axis("seed").reset_index()
-                greedy.append(rows.assign(**names, training_seed=key.seed, samples=noise.mark))
+                greedy.append(rows.assign(**names, training_seed=run.seed, samples=noise.mark))
             elif file.startswith("online-"):
                 rows = store.measured(file)[["J"]].rename_axis("training_seed").reset_index()
                 online.append(rows.assign(**names, samples=noise.steps))
         if run.marks and run.training is not None:
             rows = read_table(store.folder / LOG, types={"samples": int})
-            alive.append(rows.assign(**names, training_seed=key.seed))
+            alive.append(rows.assign(**names, training_seed=run.seed))
         elif online:
             alive.append(pd.concat(online).sort_values(["training_seed", "samples"]))
     return _stacked(alive, LIVES), _stacked(greedy, [*KEYS, "samples", "seed", "J"])
@@ -652,9 +652,9 @@ def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
     rows = []
     for store in stores:
         clock = store.about.get("timing", {})
-        seconds = {str(store.run.key): clock.get("wall_seconds", 0.0)}
+        seconds = {str(store.run): clock.get("wall_seconds", 0.0)}
         marks = clock.get("processor_seconds", {})
-        seconds |= {f"{store.run.key}, sample {mark}": value for mark, value in marks.items()}
+        seconds |= {f"{store.run}, sample {mark}": value for mark, value in marks.items()}
         rows += [{"run": name, "training_seconds": float(value)} for name, value in seconds.items()]
     return pd.DataFrame(rows, columns=["run", "training_seconds"])
 

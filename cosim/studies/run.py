@@ -110,32 +110,6 @@ def to_csv(frame: pd.DataFrame) -> str:
 # What a run is
 
 
-@dataclass(frozen=True)
-class TrainingTask:
-    """Arguments of `learning`'s `prepare`: equal ones give equal θ on any worker."""
-
-    algorithm: str
-    scenario: Scenario
-    samples: int
-    settings: Mapping[str, Any]
-    options: Mapping[str, Any]
-
-    def prepare(self) -> TrainingRun:
-        """The training run, checked; raises LearningError in one line."""
-        from learning.training import prepare  # noqa: PLC0415
-
-        return prepare(self.algorithm, self.scenario, self.samples, self.settings, self.options)
-
-    def controller(self, parameters: str) -> RtiNmpc:
-        """The greedy controller of the θ that a TOML text holds."""
-        problem = Problem.from_scenario(self.scenario)
-        with temporary_folder("cosim-theta-") as folder:
-            path = folder / "parameters.toml"
-            path.write_text(parameters, "utf-8")
-            found = Parameters.load(path, problem)
-        return nmpc(self.scenario, found, self.options["controller"])
-
-
 class Noise(NamedTuple):
     """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`.
 
@@ -164,18 +138,30 @@ def safe(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class RunKey:
-    """A run: scenario, case, and training seed (None for a controller).
+class Run:
+    """One run of a case on a scenario: a controller, or a training with a `seed`, and its θ.
+
+    `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
+    training. `training` holds the other arguments of `learning`'s `prepare`: equal ones give equal
+    θ on any worker. `facts` are all that its results depend on, `noise` that of its evaluations, by
+    the file of the results; `kept` where the study keeps a copy of a file, relative to its folder;
+    `marks` the samples of operation at which θ, or the optimum, is judged.
 
     Raises StudyError where a name is made of dots, or has a separator of folders.
     """
 
-    scenario: str
+    scenario: Scenario
     case: str
+    facts: Mapping[str, Any]
+    noise: Mapping[str, Noise]
+    controller: Any = None
     seed: int | None = None
+    training: Mapping[str, Any] | None = None
+    kept: Mapping[str, str] = field(default_factory=dict)
+    marks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in (self.scenario, self.case):
+        for name in (self.scenario.name, self.case):
             if not name.strip(". ") or "/" in name or "\\" in name:
                 raise StudyError(
                     f"'{name}' cannot name a scenario, case or controller: it would name a folder "
@@ -185,38 +171,33 @@ class RunKey:
     @property
     def folder(self) -> Path:
         """Where its files are, relative to the study's folder."""
-        parts = [safe(self.scenario), safe(self.case)]
+        parts = [safe(self.scenario.name), safe(self.case)]
         return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
 
     def __str__(self) -> str:
         seed = "" if self.seed is None else f", seed {self.seed}"
-        return f"{self.case} on {self.scenario}{seed}"
+        return f"{self.case} on {self.scenario.name}{seed}"
 
+    def prepared(self) -> TrainingRun:
+        """The training, checked; raises LearningError in one line."""
+        from learning.training import prepare  # noqa: PLC0415
 
-@dataclass(frozen=True)
-class Run:
-    """One run: a controller, or a training and its θ.
+        return prepare(scenario=self.scenario, **(self.training or {}))
 
-    `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `facts` are all that its results depend on, `noise` that of its evaluations, by the
-    file of the results; `kept` where the study keeps a copy of a file, relative to its folder;
-    `marks` the samples of operation at which θ, or the optimum, is judged.
-    """
-
-    key: RunKey
-    scenario: Scenario
-    controller: Any
-    training: TrainingTask | None
-    facts: Mapping[str, Any]
-    noise: Mapping[str, Noise]
-    kept: Mapping[str, str] = field(default_factory=dict)
-    marks: tuple[int, ...] = ()
+    def learnt(self, parameters: str) -> RtiNmpc:
+        """The training's greedy controller with the θ that a TOML text holds."""
+        problem = Problem.from_scenario(self.scenario)
+        with temporary_folder("cosim-theta-") as folder:
+            path = folder / "parameters.toml"
+            path.write_text(parameters, "utf-8")
+            found = Parameters.load(path, problem)
+        return nmpc(self.scenario, found, (self.training or {})["options"]["controller"])
 
     @property
     def samples(self) -> int:
         """Plant samples of the run; those of greedy evaluations while training apart."""
-        trained = 0 if self.training is None else self.training.samples
-        return trained + sum(noise.samples for noise in self.noise.values())
+        trained = 0 if self.training is None else self.training["samples"]
+        return int(trained) + sum(noise.samples for noise in self.noise.values())
 
 
 # A worker's part of a run
@@ -307,8 +288,7 @@ def _train(run_: Run, folder: Path | None) -> Trained:
     from cosim.studies import operation  # noqa: PLC0415
     from learning.training import COLUMNS, LogRow, run_training, to_csv  # noqa: PLC0415
 
-    assert run_.training is not None
-    run, marks, begin = run_.training.prepare(), run_.marks, time.perf_counter()
+    run, marks, begin = run_.prepared(), run_.marks, time.perf_counter()
     clock: Mapping[int, float] = {}
     if marks:
         rows, status, clock, taken = operation.live(run, marks)
@@ -336,7 +316,7 @@ def _simulate(item: Item) -> Measured | str:
         scenario = plant_at(scenario, mark * scenario.sampling_time)
     controller: Controller
     if run.training is not None:
-        controller = _judging(run.training, item)
+        controller = _judging(item)
     elif mark:
         controller = optimum_at(run.scenario, mark)
     elif isinstance(factory, str):
@@ -354,11 +334,11 @@ _judged: dict[str, tuple[RtiNmpc, Vector]] = {}
 """The run that was judged last here: its controller and final θ."""
 
 
-def _judging(training: TrainingTask, item: Item) -> RtiNmpc:
+def _judging(item: Item) -> RtiNmpc:
     """The controller with an item's θ; to build one takes as long as 8000 of its samples."""
-    key = f"{item.run.key} {item.run.facts} {item.run.noise} {item.parameters}"
+    key = f"{item.run} {item.run.facts} {item.run.noise} {item.parameters}"
     if key not in _judged:
-        controller = training.controller(item.parameters)
+        controller = item.run.learnt(item.parameters)
         _judged.clear()
         _judged[key] = controller, controller.theta
     controller, final = _judged[key]
@@ -385,7 +365,7 @@ class RunStore:
     """
 
     def __init__(self, out: Path, run: Run) -> None:
-        self.folder = out / run.key.folder
+        self.folder = out / run.folder
         self.remarks: list[str] = []
         """What was changed or damaged and is done anew, in words."""
         self.run = run
@@ -500,7 +480,7 @@ class RunStore:
                 yield replace(base, folder=self.folder.absolute() if shared_disk else None)
                 return
             base = replace(base, parameters=(self.folder / PARAMETERS).read_text("utf-8"))
-            self.done = training.samples
+            self.done = training["samples"]
         for file, noise in self.run.noise.items():
             missing = noise._replace(seeds=self.missing(file))
             self.done += noise.samples - missing.samples
@@ -583,14 +563,12 @@ class Runner:
 
     def __init__(self, runs: list[Run], out: Path, folders: tuple[Path, ...], report: Report):
         self._report, self._folders = report, tuple(map(str, dict.fromkeys(folders)))
-        taken: dict[str, RunKey] = {}
+        taken: dict[str, Run] = {}
         for run in runs:  # upper and lower case are equal on some systems
-            other = taken.setdefault(str(run.key.folder).lower(), run.key)
-            if other is not run.key:
-                raise StudyError(
-                    f"'{run.key}' and '{other}' would have one folder; rename one of them"
-                )
-        self.stores = {str(run.key): RunStore(out, run) for run in runs}
+            other = taken.setdefault(str(run.folder).lower(), run)
+            if other is not run:
+                raise StudyError(f"'{run}' and '{other}' would have one folder; rename one of them")
+        self.stores = {str(run): RunStore(out, run) for run in runs}
         self.failures: dict[str, Failure] = {}
         """The first failure of each run that failed."""
         self.remarks = list(dict.fromkeys(x for s in self.stores.values() for x in s.remarks))
@@ -632,7 +610,7 @@ class Runner:
 
     def _take(self, item: Item, outcome: Outcome) -> None:
         """Store and report the outcome of an item."""
-        name = str(item.run.key)
+        name = str(item.run)
         store, line = self.stores[name], ""
         if isinstance(outcome, Failure):
             if name in self.failures:

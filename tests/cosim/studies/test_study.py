@@ -267,14 +267,14 @@ def moved(folder, start="clean"):
     shutil.copy(ROOT / "results" / "starts" / f"{start}.toml", folder / "start.toml")
     runs = [{"controller": "start.toml"}, case("q", start="start.toml")]
     found = plan(Study.from_dict(document(case=runs), folder))
-    return {run.key: run.facts for run in found.runs}
+    return {run.case: run.facts for run in found.runs}
 
 
 def test_a_study_that_moved_keeps_its_runs_and_another_theta_at_the_start_is_another_run(tmp_path):
     here = moved(tmp_path / "here")
     assert here == moved(tmp_path / "there")
     changed = moved(tmp_path / "other", "fouled")
-    assert {key.case for key in here if here[key] != changed[key]} == {"start", "q"}
+    assert {key for key in here if here[key] != changed[key]} == {"start", "q"}
 
 
 def test_results_of_a_folder_are_those_that_were_returned(whole):

@@ -133,7 +133,7 @@ def _summary(found: StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is timing.csv by run."""
     from cosim.studies.run import TIMING, read_table
 
-    timing = read_table(found.folder / TIMING, types={"run": str})
+    timing = read_table(found.folder / TIMING, needed=["run"])
     return {
         **found.about,
         "summary": found.summary.to_dict("records"),

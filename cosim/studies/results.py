@@ -47,17 +47,24 @@ from cosim.studies.run import (
     read_table,
     safe,
     to_csv,
+    typed,
 )
 from cosim.validation import instead, known_keywords
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
-OPERATION = "operation.csv"
+TABLES, OPERATION = (RUNS, EVALUATION, CURVES), "operation.csv"
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]
-LIVES = [*KEYS, "samples", *operation.LIFE]
-CURVE = ["samples", "J", "greedy_J", "td_error"]
+MEASURED = {
+    RUNS: STATE,
+    EVALUATION: [*KEYS, "seed", "steps", *INDICATORS],
+    CURVES: [*KEYS, "samples", "J", "greedy_J", "td_error"],
+    OPERATION: [*KEYS, "samples", *operation.LIFE],
+    GREEDY: [*KEYS, "samples", "seed", "J"],
+}
+"""Columns of the tables that runs give; `TABLES` are those of every study."""
 SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios")
 """What study.json says of a case as it is."""
 LEVELS = 4
@@ -108,13 +115,8 @@ class StudyResults(Shown):
         about = read_json(path, f"'{path}'", StudyError)
         if about.get("schema") != SCHEMA:
             raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
-        return cls(
-            folder,
-            about,
-            read_table(folder / RUNS, STATE, {"samples": int, "plant_samples": int}),
-            read_table(folder / EVALUATION, [*KEYS, "seed", "steps", *INDICATORS], {"steps": int}),
-            read_table(folder / CURVES, [*KEYS, *CURVE], {"samples": "Int64"}),
-        )
+        tables = {name: read_table(folder / name, MEASURED[name]) for name in TABLES}
+        return cls(folder, about, *tables.values())
 
     @classmethod
     def written(
@@ -128,22 +130,17 @@ class StudyResults(Shown):
         places = {key: i for i, key in enumerate(product(planned.definition.scenarios, cases))}
         runs = [store for store in stores if store.sealed]  # by training seed
         runs.sort(key=lambda store: places[store.run.scenario.name, store.run.case])
-        found = cls(out, document(planned), *_frames(runs))
+        tables = _measured(runs)
+        found = cls(out, document(planned), *(tables[name] for name in TABLES))
         for run in planned.runs:
             for name, target in run.kept.items():
                 if (source := out / run.folder / name).is_file():
                     (out / target).parent.mkdir(parents=True, exist_ok=True)
                     write_atomically(out / target, source.read_bytes())
         drawn = figures.draw(planned, out) if draw else []
-        tables = {
-            EVALUATION: found.evaluation,
-            CURVES: found.curves,
-            RUNS: found.runs,
-            SUMMARY: found.summary,
-            TIMING: _timing(stores),
-        }
-        if found.about.get("operation"):
-            tables[OPERATION], tables[GREEDY] = _lives(runs)
+        if not found.about.get("operation"):
+            del tables[OPERATION], tables[GREEDY]
+        tables |= {RUNS: found.runs, SUMMARY: found.summary, TIMING: _timing(stores)}
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
@@ -503,9 +500,9 @@ class StudyResults(Shown):
         return figures.curves_figure(curves, levels, self._looks, relative=known)
 
     def _judged(self, scenario: str) -> operation.Judged:
-        lives = read_table(self.folder / OPERATION, types={"samples": int})
-        lives = lives.reindex(columns=LIVES)  # an older table lacks the latest ones
-        greedy = read_table(self.folder / GREEDY, types={"samples": int})
+        lives = read_table(self.folder / OPERATION, needed=["samples"])
+        lives = lives.reindex(columns=MEASURED[OPERATION])  # an older table lacks the latest ones
+        greedy = read_table(self.folder / GREEDY, MEASURED[GREEDY])
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
         return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
 
@@ -514,7 +511,7 @@ class StudyResults(Shown):
         path = self.folder / TIMING
         if not path.is_file():
             return {}
-        clock = read_table(path, types={"run": str}).set_index("run").training_seconds
+        clock = read_table(path, needed=["run"]).set_index("run").training_seconds
         last = self.about["operation"][scenario]["columns"][-1]
         own = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
         names = own.case + " on " + scenario + ", seed " + own.training_seed.astype(str)
@@ -593,58 +590,41 @@ def _columns(name: str, found: Estimate) -> dict[str, float]:
     return {name: found.value, f"{name}_low": low, f"{name}_high": high}
 
 
-def _stacked(parts: Iterable[pd.DataFrame], columns: list[str]) -> pd.DataFrame:
-    """The tables one below the other, with these columns."""
-    parts = [part for part in parts if len(part)]
-    table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-    return table.reindex(columns=columns).astype({"training_seed": "Int64"})
+def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
+    """The tables `MEASURED` of finished runs.
 
-
-def _frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:
-    """State, evaluation and curves of finished runs."""
-    states, evaluations, curves = [], [], []
+    In operation the optimum has a life on the noise of every training seed, of which J is known.
+    """
+    parts: dict[str, list[pd.DataFrame]] = {name: [] for name in MEASURED}
     for store in stores:
         run, about = store.run, store.about
         key = dict(zip(KEYS, (run.scenario.name, run.case, run.seed), strict=True))
         counts = {name: int(about.get(name, 0)) for name in ("samples", "plant_samples")}
-        states.append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
-        rows = store.measured(EVALUATION).rename_axis("seed").reset_index()
-        evaluations.append(rows.assign(**key, steps=run.noise[EVALUATION].steps))
+        parts[RUNS].append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
         if run.training is not None:
-            curves.append(read_table(store.folder / LOG).assign(**key))
-        elif GREEDY in run.noise:
-            greedy_J = float(store.measured(GREEDY).J.mean())
-            curves.append(pd.DataFrame([key | {"greedy_J": greedy_J}]))
-    curve = _stacked(curves, [*KEYS, *CURVE])
-    return [
-        _stacked(states, STATE),
-        _stacked(evaluations, [*KEYS, "seed", "steps", *INDICATORS]),
-        curve.astype({"samples": "Int64"} | dict.fromkeys(CURVE[1:], float)),
-    ]
-
-
-def _lives(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows of the lives, by run and mark, and of the greedy evaluations, by noise seed, too.
-
-    The optimum has a life on the noise of every training seed, of which J is known.
-    """
-    alive, greedy = [], []
-    for store in stores:
-        run, online = store.run, []
-        names = {"scenario": run.scenario.name, "case": run.case}
+            log = read_table(store.folder / LOG).assign(**key)
+            parts[CURVES].append(log)
+            parts[OPERATION] += [log] if run.marks else []
+        online = []
         for file, noise in run.noise.items():
+            if noise.whole:
+                continue
+            rows = store.measured(file).rename_axis("seed").reset_index()
             if noise.mark:
-                rows = store.measured(file).rename_axis("seed").reset_index()
-                greedy.append(rows.assign(**names, training_seed=run.seed, samples=noise.mark))
-            elif file.startswith("online-"):
-                rows = store.measured(file)[["J"]].rename_axis("training_seed").reset_index()
-                online.append(rows.assign(**names, samples=noise.steps))
-        if run.marks and run.training is not None:
-            rows = read_table(store.folder / LOG, types={"samples": int})
-            alive.append(rows.assign(**names, training_seed=run.seed))
-        elif online:
-            alive.append(pd.concat(online).sort_values(["training_seed", "samples"]))
-    return _stacked(alive, LIVES), _stacked(greedy, [*KEYS, "samples", "seed", "J"])
+                parts[GREEDY].append(rows.assign(**key, samples=noise.mark))
+            elif file == GREEDY:
+                mean = key | {"greedy_J": float(rows.J.mean())}
+                parts[CURVES].append(pd.DataFrame([mean]))
+            elif file == EVALUATION:
+                parts[EVALUATION].append(rows.assign(**key, steps=noise.steps))
+            else:
+                life = key | {"training_seed": rows.seed, "samples": noise.steps}
+                online.append(rows[["J"]].assign(**life))
+        if online:
+            parts[OPERATION].append(pd.concat(online).sort_values(["training_seed", "samples"]))
+    none = [pd.DataFrame()]
+    found = {name: pd.concat(own or none, ignore_index=True) for name, own in parts.items()}
+    return {name: typed(found[name].reindex(columns=columns)) for name, columns in MEASURED.items()}
 
 
 def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:

@@ -66,8 +66,11 @@ INDICATORS = (
 )  # fmt: skip
 KEY = ["seed", "steps", "burn_in"]
 TYPES: dict[str, Any] = {
-    "scenario": str, "case": str, "training_seed": "Int64", "status": str, "seed": "uint64",
-}  # fmt: skip
+    **dict.fromkeys(("scenario", "case", "status", "run"), str),
+    **dict.fromkeys(("training_seed", "samples", "plant_samples"), "Int64"),
+    **dict.fromkeys(("steps", "burn_in"), int),
+    "seed": "uint64",
+}
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 PAUSE = 20
 """Least time between two writes of the tables, in multiples of the time that one takes."""
@@ -84,22 +87,20 @@ Measured = dict[int, tuple[Figures, Figures]]
 """Indicators and times by noise seed."""
 
 
-def read_table(
-    path: Path, columns: Sequence[str] = (), types: Mapping[str, Any] | None = None
-) -> pd.DataFrame:
-    """Columns of a CSV (default: all), typed by `types` and `TYPES`.
-
-    Raises StudyError.
-    """
+def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = ()) -> pd.DataFrame:
+    """Columns of a CSV (default: all, the `needed` among them), `typed`; raises StudyError."""
     import pandas as pd  # noqa: PLC0415
 
-    kinds = TYPES | dict(types or {})
     try:
         texts = pd.read_csv(path, dtype="string", keep_default_na=False, na_values=[""])
-        names = dict.fromkeys([*(columns or texts), *(types or ())])
-        return texts[[*names]].astype({name: kinds.get(name, float) for name in names})
+        return typed(texts[list(dict.fromkeys([*(columns or texts), *needed]))])
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise StudyError(f"'{path}' is missing or damaged: {error}") from None
+
+
+def typed(frame: pd.DataFrame) -> pd.DataFrame:
+    """A frame with the types of `TYPES`."""
+    return frame.astype({name: TYPES.get(name, float) for name in frame})
 
 
 def to_csv(frame: pd.DataFrame) -> str:
@@ -443,9 +444,9 @@ class RunStore:
             return self._known[file]
         found = self._known[file] = {}
         if path.is_file():
-            wanted = () if file == TIMING else (*KEY, *INDICATORS)
+            wanted = () if file == TIMING else INDICATORS
             try:
-                rows = read_table(path, wanted, dict.fromkeys(KEY[1:], int)).set_index("seed")
+                rows = read_table(path, wanted, KEY).set_index("seed")
             except StudyError:
                 self.remarks.append(f"'{path}' is damaged; made anew")
                 return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from itertools import product
@@ -130,24 +130,23 @@ class StudyResults(Shown):
         places = {key: i for i, key in enumerate(product(planned.definition.scenarios, cases))}
         runs = [store for store in stores if store.sealed]  # by training seed
         runs.sort(key=lambda store: places[store.run.scenario.name, store.run.case])
-        tables = _measured(runs)
-        found = cls(out, document(planned), *(tables[name] for name in TABLES))
         for run in planned.runs:
             for name, target in run.kept.items():
                 if (source := out / run.folder / name).is_file():
                     (out / target).parent.mkdir(parents=True, exist_ok=True)
                     write_atomically(out / target, source.read_bytes())
-        drawn = figures.draw(planned, out) if draw else []
-        if not found.about.get("operation"):
+        tables, about = _measured(runs), document(planned)
+        about["pictures"] = figures.draw(planned, out) if draw else []
+        found = cls(out, about, *(tables[name] for name in TABLES))
+        if not about.get("operation"):
             del tables[OPERATION], tables[GREEDY]
         tables |= {RUNS: found.runs, SUMMARY: found.summary, TIMING: _timing(stores)}
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
             write_atomically(out / name, to_csv(table))
-        about = dict(found.about) | {"pictures": drawn}
         write_atomically(out / ABOUT, json.dumps(about, indent=1, sort_keys=True) + "\n")
-        return replace(found, about=about)
+        return found
 
     @property
     def name(self) -> str:
@@ -541,23 +540,25 @@ class StudyResults(Shown):
     def _page(self, drawn: Mapping[str, list[str]]) -> dict[str, Any]:
         """The report, for its templates.
 
-        A section has a title and may have a note, tables, and names of figures in `figures`.
+        A section has a title and may have a note, a table, and names of figures in `figures`.
         """
-        sections: list[dict[str, Any]] = []
-        for scenario in self.scenarios:
-            table = ("", *self.lines(scenario))
-            section = {"title": f"Scenario {scenario}", "note": self._noise(scenario)}
-            sections.append(section | {"tables": [table], "figures": drawn[scenario]})
+        sections: list[dict[str, Any]] = [
+            {
+                "title": f"Scenario {scenario}",
+                "note": self._noise(scenario),
+                "table": self.lines(scenario),
+                "figures": drawn[scenario],
+            }
+            for scenario in self.scenarios
+        ]
         if len(self.aggregate):
-            rows = self.aggregate.to_dict("records")
-            table = ("", *report.texts(rows, report.AGGREGATE))
-            sections.append({"title": "All scenarios", "tables": [table]})
-        for title, header, lines in self.further():
-            sections.append({"title": title, "tables": [("", header, lines)]})
+            table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE)
+            sections.append({"title": "All scenarios", "table": table})
+        sections += [{"title": title, "table": table} for title, *table in self.further()]
         if self.about["pictures"]:
             sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
-        table = ("", *report.texts(self.cases.values(), report.CASES))
-        sections.append({"title": "Cases", "tables": [table]})
+        table = report.texts(self.cases.values(), report.CASES)
+        sections.append({"title": "Cases", "table": table})
         made = self.about["made_with"]
         return {
             "title": self.about["title"] or self.name,
@@ -666,7 +667,6 @@ def document(plan: Plan) -> dict[str, Any]:
         "curves": {name: [len(noise.seeds), noise.steps] for name, noise in curves.items()},
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
-        "pictures": [],
         "made_with": dict(plan.provenance) | {"commit": report.commit()},
     }
     trains = any(case.algorithm for case in definition.cases)

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from controllers.optimum import stored_optimum
+from cosim import statistics
 from cosim.errors import EvaluationError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
@@ -20,26 +21,7 @@ from cosim.protocols import Array, Controller, Decision
 from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, reporting, simulate
-from cosim.statistics import (
-    bootstrapped,
-    gain,
-    gains,
-    gap_closed,
-    gaps_closed,
-    magnitude,
-    mean,
-    regret,
-    regrets,
-)
-from cosim.studies.run import (
-    EVALUATION,
-    TIMING,
-    Noise,
-    Report,
-    Run,
-    Runner,
-    to_csv,
-)
+from cosim.studies.run import EVALUATION, TIMING, Noise, Report, Run, Runner, to_csv
 from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:
@@ -237,9 +219,9 @@ class Evaluation(Result):
         cost, names = frame.J.to_numpy(), (NAIVE, OPTIMAL, self.reference)
         naive, optimal, reference = (np.tile(self._cost(n), len(self.controllers)) for n in names)
         frame["parameters_hash"] = frame.controller.map(self.parameters)
-        frame["regret"] = regrets(cost, optimal)
-        frame["gap_closed"] = gaps_closed(cost, naive, optimal)
-        frame["gain_in_J"] = gains(cost, reference)
+        frame["regret"] = statistics.regrets(cost, optimal)
+        frame["gap_closed"] = statistics.gaps_closed(cost, naive, optimal)
+        frame["gain_in_J"] = statistics.gains(cost, reference)
         return frame[COLUMNS].astype({"failures": int})
 
     def _rows(self, frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
@@ -303,32 +285,34 @@ class Evaluation(Result):
         }
 
     def _controller(self, name: str) -> dict[str, Any]:
-        estimates = {key: mean(self.column(name, key))._asdict() for key in MEANS}
+        estimates = {key: statistics.mean(self.column(name, key))._asdict() for key in MEANS}
         document: dict[str, Any] = {key: one.pop("value") for key, one in estimates.items()}
         document |= {
             "failures": int(np.sum(self.column(name, "failures"))),
             "parameters_hash": self.parameters[name],
             "intervals": estimates,
         }
-        cost, naive = self._cost(name), self._cost(NAIVE)
+        cost, best = self._cost(name), self.optimal
         if self.optimum is not None:
-            resampled = bootstrapped(cost - self.optimal, magnitude(self.optimal))
-            document["regret"] = regret(cost, self.optimal)._asdict() | {"bootstrap": resampled}
-        if self.optimum is not None and NAIVE in self.controllers:
-            document["gap_closed"] = gap_closed(cost, naive, self.optimal)._asdict()
+            resampled = statistics.bootstrapped(cost - best, statistics.magnitude(best))
+            found = statistics.regret(cost, best)._asdict()
+            document["regret"] = found | {"bootstrap": resampled}
+            if NAIVE in self.controllers:
+                gap = statistics.gap_closed(cost, self._cost(NAIVE), best)
+                document["gap_closed"] = gap._asdict()
         return document
 
     def _comparison(self, name: str, reference: str) -> dict[str, Any]:
         cost, other = self._cost(name), self._cost(reference)
-        resampled = bootstrapped(other - cost, magnitude(other))
+        resampled = statistics.bootstrapped(other - cost, statistics.magnitude(other))
         return {
             "controller": name,
             "reference": reference,
             "differences": {
-                key: mean(self.column(name, key) - self.column(reference, key))._asdict()
+                key: statistics.mean(self.column(name, key) - self.column(reference, key))._asdict()
                 for key in COMPARED
             },
-            "gain_in_J": gain(cost, other)._asdict() | {"bootstrap": resampled},
+            "gain_in_J": statistics.gain(cost, other)._asdict() | {"bootstrap": resampled},
         }
 
 

@@ -16,15 +16,7 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
 from cosim.scenario import Scenario, resolved
 from cosim.studies.document import DEFAULT, CaseTable, StudyTable, read
-from cosim.studies.run import (
-    EVALUATION,
-    GREEDY,
-    LOG,
-    PARAMETERS,
-    Noise,
-    Run,
-    safe,
-)
+from cosim.studies.run import EVALUATION, GREEDY, LOG, PARAMETERS, Noise, Run, safe
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError

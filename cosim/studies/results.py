@@ -15,23 +15,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
 from cosim.figures.style import Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
 from cosim.simulation import reporting
-from cosim.statistics import (
-    Estimate,
-    gain,
-    gap_closed,
-    over_runs,
-    paired_difference,
-    regret,
-    regrets,
-    shown,
-    two_way,
-)
+from cosim.statistics import Estimate, over_runs, paired_difference, shown, two_way
 from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
 from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
@@ -205,14 +196,15 @@ class StudyResults(Shown):
         """(J − J*)/|J*| of the mean of `runs` (from 0), paired over noise seeds; NaN without J*."""
         best = self.reference("optimum", scenario)
         cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
-        return Estimate(np.nan) if best is None else regret(cost, best)
+        return Estimate(np.nan) if best is None else statistics.regret(cost, best)
 
     def gap_closed(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
         """(J_naive − J)/(J_naive − J*), likewise."""
         best, naive = (self.reference(kind, scenario) for kind in ("optimum", "naive"))
         if best is None or naive is None:
             return Estimate(np.nan)
-        return gap_closed(self.indicator(case, scenario)[list(runs)].mean(axis=0), naive, best)
+        cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
+        return statistics.gap_closed(cost, naive, best)
 
     @cached_property
     def runs(self) -> pd.DataFrame:
@@ -404,7 +396,7 @@ class StudyResults(Shown):
             order = np.argsort(cost.mean(axis=1), kind="stable")
             middle = order[(len(order) - 1) // 2]
             gains = [
-                gain(self.indicator(case, scenario, name)[middle], base[0])
+                statistics.gain(self.indicator(case, scenario, name)[middle], base[0])
                 for name in ("J", "economic_cost")
                 for base in (self.indicator(base, scenario, name) for base in PAPER)
             ]
@@ -494,7 +486,7 @@ class StudyResults(Shown):
         marks = marks[np.isfinite(marks)]
         # Naive stays: it is where the curves begin.
         chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
-        level = 100 * regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
+        level = 100 * statistics.regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
         levels = dict(zip(chosen, map(float, level), strict=True))
         return figures.curves_figure(curves, levels, self._looks, relative=known)
 

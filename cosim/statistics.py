@@ -130,16 +130,11 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
     Entries at a quarter of R count with their share. Source: Agarwal et al., Deep RL at the Edge of
     the Statistical Precipice.
     """
-    ordered = np.sort(values, axis=axis)
-    count = ordered.shape[axis]
-    edges = np.arange(count + 1)
-    upper, lower = np.minimum(edges[1:], 0.75 * count), np.maximum(edges[:-1], 0.25 * count)
-    weight = np.maximum(upper - lower, 0.0)
-    shape = [1] * ordered.ndim
-    shape[axis] = count
-    with np.errstate(invalid="ignore"):
-        share = np.where(weight.reshape(shape) > 0, ordered, 0.0) * weight.reshape(shape)
-    return share.sum(axis=axis) / weight.sum()
+    ordered = np.sort(np.moveaxis(values, axis, -1))
+    count = ordered.shape[-1]
+    weight = np.diff(np.clip(np.arange(count + 1), 0.25 * count, 0.75 * count))
+    inside = np.where(weight > 0, ordered, 0.0)  # values outside may be infinite
+    return (inside * weight).sum(axis=-1) / weight.sum()
 
 
 def over_runs(strata: Sequence[Array]) -> Estimate:
@@ -168,12 +163,10 @@ def td_error_mean(
     """
     counts = np.where(np.isfinite(td_error), updates, 0.0)
     squares = np.where(counts > 0, td_error, 0.0) ** 2 * counts
-    total = np.concatenate([[0.0], np.cumsum(squares)])
-    count = np.concatenate([[0.0], np.cumsum(counts)])
-    first = np.searchsorted(np.concatenate([[0.0], samples]), samples - window, side="left")
-    last = np.arange(1, len(samples) + 1)
-    below = count[last] - count[first]
-    mean = np.maximum(total[last] - total[first], 0.0) / np.where(below > 0, below, 1.0)
+    total = np.pad(np.cumsum([squares, counts], axis=1), ((0, 0), (1, 0)))
+    first = np.searchsorted(np.append(0.0, samples), samples - window, side="left")
+    above, below = total[:, 1:] - total[:, first]
+    mean = np.maximum(above, 0.0) / np.where(below > 0, below, 1.0)
     return np.where(below > 0, np.sqrt(mean), np.nan)
 
 

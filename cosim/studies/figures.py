@@ -19,7 +19,6 @@ from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, Dots, EndLabel, Look, palette, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
-from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
 from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import regrets, td_error_mean
@@ -371,11 +370,9 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
 
 
 def _policy(run: Run, out: Path) -> Policy:
-    controller: Controller = (
-        build_controller(run.controller, run.scenario)
-        if run.training is None
-        else run.learnt((out / run.folder / PARAMETERS).read_text("utf-8"))
-    )
+    trained = run.training is not None
+    theta = (out / run.folder / PARAMETERS).read_text("utf-8") if trained else ""
+    controller: Controller = run.policy(theta)
 
     def act(s: Array) -> Array:
         controller.reset()

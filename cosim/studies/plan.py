@@ -142,6 +142,7 @@ class Study:
         if empty := [key for key, values in axes.items() if not values]:
             raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
         varied = [key for key, values in axes.items() if len(values) > 1]
+        seeds = table.training_seeds or self.table.training_seeds
         for values in product(*axes.values()):
             point = dict(zip(axes, values, strict=True))
             label = " ".join(f"{key}={_text(point[key])}" for key in varied)
@@ -155,7 +156,7 @@ class Study:
                 nmpc=point.pop("nmpc"),
                 settings=point,
                 training=dict(table.training),
-                training_seeds=tuple((table.training_seeds or self.table.training_seeds).seeds),
+                training_seeds=tuple(range(seeds.first, seeds.first + seeds.count)),
                 against=table.against,
             )
 

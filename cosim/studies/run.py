@@ -185,14 +185,18 @@ class Run:
 
         return prepare(scenario=self.scenario, **(self.training or {}))
 
-    def learnt(self, parameters: str) -> RtiNmpc:
-        """The training's greedy controller with the θ that a TOML text holds."""
+    def policy(self, parameters: str = "") -> Any:
+        """The controller; of a training the greedy one of the θ that a TOML text holds."""
+        if self.training is None:
+            if isinstance(self.controller, str):
+                return build_controller(self.controller, self.scenario)
+            return self.controller(self.scenario)
         problem = Problem.from_scenario(self.scenario)
         with temporary_folder("cosim-theta-") as folder:
             path = folder / "parameters.toml"
             path.write_text(parameters, "utf-8")
             found = Parameters.load(path, problem)
-        return nmpc(self.scenario, found, (self.training or {})["options"]["controller"])
+        return nmpc(self.scenario, found, self.training["options"]["controller"])
 
     @property
     def samples(self) -> int:
@@ -310,7 +314,7 @@ def _train(run_: Run, folder: Path | None) -> Trained:
 
 def _simulate(item: Item) -> Measured | str:
     run, (seeds, steps, burn_in, whole, mark) = item.run, item.noise
-    scenario, factory = run.scenario, run.controller
+    scenario = run.scenario
     if mark:
         from cosim.studies.operation import optimum_at, plant_at  # noqa: PLC0415
 
@@ -318,12 +322,8 @@ def _simulate(item: Item) -> Measured | str:
     controller: Controller
     if run.training is not None:
         controller = _judging(item)
-    elif mark:
-        controller = optimum_at(run.scenario, mark)
-    elif isinstance(factory, str):
-        controller = build_controller(factory, scenario)
     else:
-        controller = factory(scenario)
+        controller = optimum_at(run.scenario, mark) if mark else run.policy()
     compile_functions(controller, sum(noise.samples for noise in run.noise.values()))
     with FmuPlant(scenario) as plant:
         if whole:
@@ -339,7 +339,7 @@ def _judging(item: Item) -> RtiNmpc:
     """The controller with an item's θ; to build one takes as long as 8000 of its samples."""
     key = f"{item.run} {item.run.facts} {item.run.noise} {item.parameters}"
     if key not in _judged:
-        controller = item.run.learnt(item.parameters)
+        controller = item.run.policy(item.parameters)
         _judged.clear()
         _judged[key] = controller, controller.theta
     controller, final = _judged[key]

@@ -205,15 +205,6 @@ def _t_interval(residuals: Array, value: float) -> Interval:
     return value - half, value + half
 
 
-def two_way(cost: Array, optimum: Array) -> Interval:
-    """Interval of the median over R runs of their regret, over runs and noise together.
-
-    `cost` (R, S) is J of each run and noise seed, `optimum` (S,) J* on the same noise. Runs and
-    noise seeds are resampled independently (percentiles). None for one seed.
-    """
-    return _two_way(cost - optimum, magnitude(optimum))
-
-
 def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float, Interval, float]:
     """Median over R pairs of runs of (J − J')/|J*|, its interval over pairs and noise, and p.
 
@@ -231,12 +222,18 @@ def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float,
         flips = 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1) - 1
     reached = np.abs(flips @ ranks) >= abs(float(np.sign(each) @ ranks)) - 1e-9
     p = (1 + reached.sum()) / (1 + len(flips)) if count > 12 else reached.mean()
-    interval = _two_way(cost - other, below)
+    interval = two_way(cost, optimum, other)
     return float(np.median(each)), interval, float(p) if count > 1 else float("nan")
 
 
-def _two_way(terms: Array, below: Array) -> Interval:
-    """Percentiles of the median over rows of mean(terms)/mean(below), both axes resampled."""
+def two_way(cost: Array, optimum: Array, other: Array | None = None) -> Interval:
+    """Interval of the median over R runs of (J − J')/|J*|, over runs and noise together.
+
+    `cost` (R, S) is J of each run and noise seed, `optimum` (S,) J* on the same noise, `other` J',
+    (R, S), else J*. Runs and noise seeds are resampled independently (percentiles). None for one
+    seed.
+    """
+    terms, below = cost - (optimum if other is None else other), magnitude(optimum)
     runs, seeds = terms.shape
     if seeds < 2:
         return None

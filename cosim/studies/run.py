@@ -85,6 +85,9 @@ ROUNDS = 3
 Figures = dict[str, Any]
 Measured = dict[int, tuple[Figures, Figures]]
 """Indicators and times by noise seed."""
+Trained = tuple[str, str, Figures]
+"""learning.csv and θ at the end of a training, as texts, and what run.json says of it: `status`
+(`finished` or `diverged: …`), `samples`, `plant_samples`, and `timing` in s."""
 
 
 def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = ()) -> pd.DataFrame:
@@ -208,18 +211,6 @@ class Run:
 # A worker's part of a run
 
 
-class Trained(NamedTuple):
-    """A training at its end: learning.csv and θ as texts, and what run.json says of it.
-
-    That is its `status`, `finished` or `diverged: …`, its `samples`, `plant_samples`, all that the
-    plant gave for it, and `timing`: seconds, of operation also the processor's up to each mark.
-    """
-
-    log: str
-    parameters: str
-    about: Mapping[str, Any]
-
-
 @dataclass(frozen=True)
 class Item:
     """Unit of work of one process, independent of the machine.
@@ -309,7 +300,7 @@ def _train(run_: Run, folder: Path | None) -> Trained:
         rows = [LogRow(start | {"samples": 0.0}, result.start), *result.rows]
     seconds = {"wall_seconds": time.perf_counter() - begin, "processor_seconds": clock}
     about = {"status": status, "samples": samples, "plant_samples": taken, "timing": seconds}
-    return Trained(to_csv(rows), theta.to_toml(), about)
+    return to_csv(rows), theta.to_toml(), about
 
 
 def _simulate(item: Item) -> Measured | str:
@@ -501,12 +492,12 @@ class RunStore:
         self.done += item.noise.samples
         if isinstance(outcome, str):
             write_atomically(self.folder / item.file, outcome)
-        elif isinstance(outcome, Trained):
-            self.done = outcome.about["samples"]
-            write_atomically(self.folder / LOG, outcome.log)
-            write_atomically(self.folder / PARAMETERS, outcome.parameters)
-            files = {name: _digest(self.folder / name) for name in TRAINED}
-            self._note(**outcome.about, files=files)
+        elif isinstance(outcome, tuple):
+            *texts, about = outcome
+            for name, text in zip(TRAINED, texts, strict=True):
+                write_atomically(self.folder / name, text)
+            self.done = about["samples"]
+            self._note(**about, files={name: _digest(self.folder / name) for name in TRAINED})
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
         else:
             parts = [(item.file, 0), *([(TIMING, 1)] if item.file == EVALUATION else [])]
@@ -621,7 +612,7 @@ class Runner:
             self._tell(f"failed: {name}: {outcome.message}")
             return
         store.take(item, outcome)
-        if isinstance(outcome, Trained):
+        if isinstance(outcome, tuple):
             line = "" if store.status == "finished" else f"{name}: {store.status}"
         else:
             store.seal()

@@ -132,8 +132,8 @@ class Study:
             for source in sources if isinstance(sources, list) else [sources]:
                 own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
                 name = f"{table.name}({own})" if table.name and sources[1:] else table.name or own
-                group, file = table.group or BASELINES, self._file(source)
-                yield Case(name, scenarios, group, controller=file, against=table.against)
+                group = table.group or BASELINES
+                yield Case(name, scenarios, group, controller=source, against=table.against)
             return
         given = {"samples": table.samples, "start": table.start, "nmpc": table.nmpc}
         axes: dict[str, list[Any]]
@@ -152,7 +152,7 @@ class Study:
                 group=table.group or table.algorithm.rpartition(":")[2],
                 algorithm=table.algorithm,
                 samples=point.pop("samples"),
-                start=self._file(point.pop("start")),
+                start=point.pop("start"),
                 nmpc=point.pop("nmpc"),
                 settings=point,
                 training=dict(table.training),
@@ -160,10 +160,9 @@ class Study:
                 against=table.against,
             )
 
-    def _file(self, source: str) -> str:
-        """A relative path from the study's folder; other names unchanged."""
-        is_file = source.endswith(".toml") and not Path(source).is_absolute()
-        return str(self.folder / source) if is_file else source
+    def located(self, source: str) -> str:
+        """A parameters file's path, given from the study's folder; other names as they are."""
+        return str(self.folder / source) if source.endswith(".toml") else source
 
     def counterpart(self, case: Case) -> str | None:
         """Name of the case that a case's paired difference is taken from; raises StudyError.
@@ -215,12 +214,6 @@ class Study:
         """A controller's name in the tables: the one that the study gives, else its own."""
         return next((c.name for c in self.cases if c.controller == controller), controller)
 
-    def relative(self, path: str) -> str:
-        """A parameters file by its path from the study, so that results depend on no folder."""
-        if not path.endswith(".toml") or self.folder not in Path(path).parents:
-            return path
-        return Path(path).relative_to(self.folder).as_posix()
-
     def noise(self, scenario: str) -> Noise:
         """Noise on which the cases of a scenario are compared."""
         table = self.table.evaluation
@@ -269,7 +262,7 @@ class Study:
         between = max(1, samples // self.table.curves.points)
         rows = -(-between // ROW)
         log_every = max(1, between // rows)
-        own = {"seed": seed, "controller": case.nmpc, "start": case.start}
+        own = {"seed": seed, "controller": case.nmpc, "start": self.located(case.start)}
         if twice := sorted(own.keys() & case.training):
             raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
         options = {
@@ -324,13 +317,12 @@ def plan(study: Study) -> Plan:
             if training is not None:
                 prepare(scenario=scenario, **training)
             parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
-            depends[case.name, name] = depends_on(scenario, *parts)
+            depends[case.name, name] = depends_on(scenario, *map(study.located, parts))
         facts: dict[str, Any] = {**depends[case.name, name], "fmu": plants[name]["fmu"]}
         if training is None:
-            facts["controller"] = study.relative(case.controller or "")
-        else:
-            options = training["options"] | {"start": study.relative(case.start)}
-            facts["training"] = training | {"options": options}
+            facts["controller"] = case.controller
+        else:  # as the file says, so that results depend on no folder
+            facts["training"] = training | {"options": training["options"] | {"start": case.start}}
         judged = training is not None or case.name == study.optima.get(name)
         marks = study.marks(name) if judged else ()
         noise = {EVALUATION: (own := study.noise(name))}
@@ -356,8 +348,8 @@ def plan(study: Study) -> Plan:
         seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
         if training is None and seeds:  # the optimum, on the noise of the training seeds
             noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
-        run = Run(scenario, case.name, facts, noise, case.controller, seed, training, kept, marks)
-        runs.append(run)
+        source = study.located(case.controller or "") or None
+        runs.append(Run(scenario, case.name, facts, noise, source, seed, training, kept, marks))
     _check_names(study)
     about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})

@@ -56,7 +56,7 @@ MEASURED = {
     GREEDY: [*KEYS, "samples", "seed", "J"],
 }
 """Columns of the tables that runs give; `TABLES` are those of every study."""
-SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios")
+SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
 """What study.json says of a case as it is."""
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
@@ -639,8 +639,6 @@ def document(plan: Plan) -> dict[str, Any]:
         "cases": [
             {
                 **{name: getattr(case, name) for name in SAME},
-                "start": definition.relative(case.start),
-                "target": definition.relative(case.target),
                 "trained": case.algorithm is not None,
                 "against": definition.counterpart(case),
             }

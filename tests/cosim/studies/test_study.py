@@ -246,10 +246,14 @@ def test_lists_are_a_grid_and_name_what_varies():
 
 
 def test_files_are_seen_from_the_study():
-    assert cases(start="mine.toml")[0].start == str(Path("/study/mine.toml"))
+    study = Study.from_dict(document(), "/study")
+    assert [study.located(name) for name in ("mine.toml", "naive")] == [
+        str(Path("/study/mine.toml")),
+        "naive",
+    ]
     found = cases(name=None, algorithm=None, controller=["theta/mine.toml", "module:make"])
     assert [(one.name, one.training_seeds) for one in found] == [("mine", ()), ("module.make", ())]
-    assert found[0].controller == str(Path("/study/theta/mine.toml"))
+    assert found[0].controller == "theta/mine.toml"
 
 
 def test_a_counterpart_is_that_of_the_same_point_of_the_grid():

@@ -76,9 +76,8 @@ def _execute(
                 figures=figures,
             )
         except FailedRunsError as error:
-            failure = error
-    out_.note(f"failed: {failure}")
-    raise typer.Exit(1)
+            out_.note(f"failed: {error}")
+            raise typer.Exit(1) from None
 
 
 @app.command("plan")

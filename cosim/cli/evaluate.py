@@ -5,14 +5,12 @@ from __future__ import annotations
 import shlex
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
-
-if TYPE_CHECKING:
-    from cosim.scenario import Scenario
 
 
 def evaluate(
@@ -44,7 +42,6 @@ def evaluate(
     with cli.output(json) as out_:
         from loky import cpu_count
 
-        from cosim.evaluation import evaluate as run
         from cosim.evaluation import named_controllers
         from cosim.files import write_atomically
 
@@ -60,7 +57,7 @@ def evaluate(
         out_.announce(task.plant.fmu)
         total = (len(named) + ("optimal" not in named)) * seeds * steps
         with cli.followed(out_, f"samples on {task.name}", total) as report:
-            evaluation = run(
+            evaluation = cosim.evaluate(
                 task,
                 named,
                 range(first_seed, first_seed + seeds),
@@ -79,7 +76,7 @@ def evaluate(
         out_.json(summary, folder)
 
 
-def _judge(scenario: Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
+def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
     from cosim.evaluation import judge
     from cosim.files import write_atomically
     from cosim.statistics import mean, regret, shown

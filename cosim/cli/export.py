@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+import cosim
 from cosim.cli.output import JsonOption, ScenarioOption, output
 
 
@@ -45,7 +46,6 @@ def export(
         from cosim.cli import controller_fmu
         from cosim.errors import CosimError
         from cosim.files import check_target
-        from cosim.scenario import Scenario
         from fmus import PLATFORMS, present
         from fmus.model import FmiVersion
 
@@ -54,7 +54,7 @@ def export(
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
             if format_ == "fmu":  # before the minutes that compilers may take
                 check_target(target)
-        loaded = Scenario.load(scenario)
+        loaded = cosim.Scenario.load(scenario)
         names = tuple(dict.fromkeys(filter(None, measured.split(","))))
         if ssp is not None and (missing := set(names) - set(loaded.plant.disturbances)):
             raise CosimError(f"--ssp: the plant has no disturbance {', '.join(sorted(missing))}")

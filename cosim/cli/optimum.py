@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming import Optimum, Progress
     from controllers.optimum import QuasiStaticPolicy
-    from cosim.scenario import Scenario
 
 
 def optimum(
@@ -47,7 +47,7 @@ def optimum(
         raise typer.Exit(1)
 
 
-def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Output) -> None:
+def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cli.Output) -> None:
     names = [name for name, value in policy.law.plants[0].items() if value is not None]
     table = [{name: plant[name] for name in names} | {"J": gain} for plant, gain in policy.gains]
     rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
@@ -59,7 +59,7 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Outp
     out_.json(document | {"table": table})
 
 
-def _solve(task: Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
+def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
     from controllers.dynamic_programming import Figure, Settings, certify, objection, solve

@@ -9,16 +9,14 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import cosim
 from cosim.errors import CosimError
 from cosim.files import write_atomically
 from cosim.processes import Terminated, hold, redirected_output, release, watch
-
-if TYPE_CHECKING:
-    from cosim.scenario import Scenario
 
 MOST = 100_000_000
 """Samples of the longest run."""
@@ -216,14 +214,13 @@ def writable_folder(folder: Path) -> Path:
     return folder
 
 
-def load_scenario(name: str) -> Scenario:
+def load_scenario(name: str) -> cosim.Scenario:
     """Load a preset or TOML file, so that its `module:function` may lie beside it or here.
 
     Raises ScenarioError.
     """
     from cosim.plugins import import_from
-    from cosim.scenario import Scenario
 
     if Path(name).is_file():
         import_from(Path(name).resolve().parent)
-    return Scenario.load(name)
+    return cosim.Scenario.load(name)

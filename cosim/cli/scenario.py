@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer.core import TyperGroup
 
+import cosim
 from cosim.cli import output as cli
-
-if TYPE_CHECKING:
-    from cosim.scenario import Scenario
 
 
 class ShowByDefault(TyperGroup):
@@ -44,15 +42,15 @@ def show(
         seed: Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.
     """
     with cli.output(json) as out_:
-        from cosim.scenario import Scenario, presets
+        from cosim.scenario import presets
 
         if name is None:
-            loaded = [Scenario.load(preset) for preset in presets()]
+            loaded = [cosim.Scenario.load(preset) for preset in presets()]
             rows = [(item.name, item.hash, item.description) for item in loaded]
             out_.table("presets", ("name", "hash", "description"), rows)
             out_.json({"presets": {item.name: item.hash for item in loaded}})
             return
-        chosen = Scenario.load(name)
+        chosen = cosim.Scenario.load(name)
         if seed is not None:
             values = _seed_values(chosen, seed)
             out_.note("\n".join(f"{key} = {dumps(value)}" for key, value in values.items()))
@@ -64,7 +62,7 @@ def show(
             print(f"# hash {chosen.hash}\n{chosen.to_toml()}", end="")
 
 
-def _seed_values(scenario: Scenario, seed: int) -> dict[str, float | bool | int]:
+def _seed_values(scenario: cosim.Scenario, seed: int) -> dict[str, float | bool | int]:
     from cosim.plant.fmu_plant import REALS, start_values
     from cosim.simulation import spawn_seeds
 
@@ -108,7 +106,6 @@ def init(
         from cosim.errors import CosimError
         from cosim.files import write_atomically
         from cosim.plant.draft import NO_NOISE, draft_scenario
-        from cosim.scenario import Scenario
 
         target = (out or Path(f"{Path(fmu).stem}.toml")).absolute()
         if target.exists() and not overwrite:
@@ -127,7 +124,7 @@ def init(
             action=_numbers(action, "--action"),
         )
         write_atomically(target, text)
-        drafted = Scenario.load(target)
+        drafted = cosim.Scenario.load(target)
         if not json:
             print(text, end="")
         if drafted.disturbance.law == "none":

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
-
-if TYPE_CHECKING:
-    from cosim.studies.results import StudyResults
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 results = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
@@ -51,22 +49,21 @@ def _execute(
     jobs: int | None,
     scheduler: str | None = None,
     figures: bool = True,
-) -> StudyResults:
+) -> cosim.StudyResults:
     """Run a study with a progress bar; exits with code 1 where runs failed."""
     from loky import cpu_count
 
     from cosim.errors import FailedRunsError
-    from cosim.studies.plan import Study, plan
-    from cosim.studies.results import study
+    from cosim.studies.plan import plan
 
-    definition = Study.load(file)
+    definition = cosim.Study.load(file)
     folder = cli.open_folder(out)
     for scenario in definition.scenarios.values():
         out_.announce(scenario.plant.fmu)
     planned = plan(definition)
     with cli.followed(out_, definition.name, planned.samples) as report:
         try:
-            return study(
+            return cosim.study(
                 definition,
                 folder,
                 jobs=jobs or cpu_count(),
@@ -86,9 +83,9 @@ def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
     with cli.output(json) as out_:
         import pandas as pd
 
-        from cosim.studies.plan import Study, plan
+        from cosim.studies.plan import plan
 
-        planned = plan(Study.load(file))
+        planned = plan(cosim.Study.load(file))
         runs = pd.DataFrame(
             [(run.scenario.name, run.case, 1, run.samples) for run in planned.runs],
             columns=["scenario", "case", "runs", "plant samples"],
@@ -119,16 +116,14 @@ def report(
             difference, p; default: case,rank,regret,worst,finished.
     """
     with cli.output(json) as out_:
-        from cosim.studies.results import StudyResults
-
-        found = StudyResults.load(folder)
+        found = cosim.StudyResults.load(folder)
         page = found.report()
         _show(found, out_, columns)
         out_.note(f"the report is {page.resolve()}")
         out_.json({"report": str(page), "runs": len(found.runs)})
 
 
-def _summary(found: StudyResults) -> dict[str, Any]:
+def _summary(found: cosim.StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is timing.csv by run."""
     from cosim.studies.run import TIMING, read_table
 
@@ -141,7 +136,7 @@ def _summary(found: StudyResults) -> dict[str, Any]:
     }
 
 
-def _show(found: StudyResults, out_: cli.Output, columns: str | None = None) -> None:
+def _show(found: cosim.StudyResults, out_: cli.Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
     from cosim.studies.report import COLUMNS, SHORT
 
@@ -196,7 +191,6 @@ def check(
     with cli.output(json) as out_:
         from cosim.files import temporary_folder
         from cosim.studies import stored
-        from cosim.studies.results import StudyResults
 
         local = Path("results")
         folder = folder or (local if local.is_dir() else stored.stored_results())
@@ -204,7 +198,7 @@ def check(
         checked = [name for name, table in studies.items() if table.check]
         quick = stored.chosen(studies, names or checked)
         for name in quick:
-            StudyResults.load(folder / name)
+            cosim.StudyResults.load(folder / name)
         found: dict[str, list[str]] = {}
         with temporary_folder("cosim-results-") as work:
             for name in quick:

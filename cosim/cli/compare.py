@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from cosim.cli.output import JsonOption, output
+from cosim.errors import ComparisonError
+from cosim.files import protect
 
 
 def compare(
@@ -31,7 +33,6 @@ def compare(
     """
     with output(json) as out_:
         from cosim import comparison
-        from cosim.files import protect
 
         runs = comparison.load_run(a), comparison.load_run(b)
         protect(run.name for run in runs)  # of a folder, the file in it
@@ -66,8 +67,6 @@ def compare(
 
 
 def _tolerance(option: str) -> tuple[str, float]:
-    from cosim.errors import ComparisonError
-
     name, _, value = option.rpartition("=")
     try:
         return name, float(value)

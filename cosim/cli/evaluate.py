@@ -11,6 +11,7 @@ import typer
 
 import cosim
 from cosim.cli import output as cli
+from cosim.files import write_atomically
 
 
 def evaluate(
@@ -43,7 +44,6 @@ def evaluate(
         from loky import cpu_count
 
         from cosim.evaluation import named_controllers
-        from cosim.files import write_atomically
 
         task = cli.load_scenario(scenario)
         if trajectories is not None:
@@ -78,7 +78,6 @@ def evaluate(
 
 def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
     from cosim.evaluation import judge
-    from cosim.files import write_atomically
     from cosim.statistics import mean, regret, shown
 
     table = judge(scenario, trajectories)

@@ -12,6 +12,8 @@ from typer.core import TyperGroup
 
 import cosim
 from cosim.cli import output as cli
+from cosim.errors import CosimError
+from cosim.files import write_atomically
 
 
 class ShowByDefault(TyperGroup):
@@ -103,8 +105,6 @@ def init(
         overwrite: Replace the file if it is there.
     """
     with cli.output(json) as out_:
-        from cosim.errors import CosimError
-        from cosim.files import write_atomically
         from cosim.plant.draft import NO_NOISE, draft_scenario
 
         target = (out or Path(f"{Path(fmu).stem}.toml")).absolute()
@@ -138,8 +138,6 @@ def _words(text: str) -> list[str]:
 
 
 def _numbers(text: str, option: str) -> list[float]:
-    from cosim.errors import CosimError
-
     try:
         return [float(word) for word in _words(text)]
     except ValueError:

@@ -245,13 +245,10 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
 
 def increments(log: pd.DataFrame) -> dict[str, Array]:
     """θ less its first row by block, (K, entries), of a training's log."""
-    theta = log[[name for name in log if name.startswith(PREFIX)]].astype(float)
+    theta = log.filter(like=PREFIX).astype(float)
+    moved = (theta - theta.iloc[0]).T
     blocks = [str(name).removeprefix(PREFIX).partition("[")[0] for name in theta]
-    moved = theta.to_numpy() - theta.to_numpy()[:1]
-    return {
-        block: moved[:, [i for i, other in enumerate(blocks) if other == block]]
-        for block in dict.fromkeys(blocks)
-    }
+    return {str(block): own.to_numpy().T for block, own in moved.groupby(blocks, sort=False)}
 
 
 def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure:

@@ -119,7 +119,8 @@ for panel, function, example in (
     (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
     (RUN, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
-    app.command(rich_help_panel=panel, epilog=f"Example: cosim {example}")(function)
+    text, epilog = _documentation(function)[0], f"Example: cosim {example}"
+    app.command(rich_help_panel=panel, help=text, epilog=epilog)(function)
 for panel, group, name, *examples in (
     (BUILD, scenario.app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
     (LEARN, study.app, "study", "run mine.toml --out study", "plan mine.toml", "report study"),
@@ -129,10 +130,7 @@ for panel, group, name, *examples in (
     texts = [f"Example: cosim {name} {example}" for example in examples]
     app.add_typer(group, name=name, rich_help_panel=panel, epilog=texts[0])
     for command, text in zip(group.registered_commands, texts, strict=True):
-        command.epilog = text
-for group in (app, scenario.app, study.app, study.results, fmu.app):
-    for command in group.registered_commands:
-        command.help = _documentation(command.callback)[0]
+        command.help, command.epilog = _documentation(command.callback)[0], text
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70

@@ -205,8 +205,7 @@ class Evaluation(Result):
         for word, known in ((controller, self.columns), (name, next(iter(self.columns.values())))):
             if word not in known:
                 raise EvaluationError(f"there is no '{word}'{instead(word, map(str, known))}")
-        found: Array = self.columns[controller][name].to_numpy()
-        return found
+        return np.asarray(self.columns[controller][name])
 
     def _cost(self, controller: str) -> Array:
         """J over the seeds, (S,), NaN of a controller that was not evaluated."""

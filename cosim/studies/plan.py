@@ -151,9 +151,7 @@ class Study:
                 scenarios=scenarios,
                 group=table.group or table.algorithm.rpartition(":")[2],
                 algorithm=table.algorithm,
-                samples=point.pop("samples"),
-                start=point.pop("start"),
-                nmpc=point.pop("nmpc"),
+                **{axis: point.pop(axis) for axis in given},
                 settings=point,
                 training=dict(table.training),
                 training_seeds=tuple(range(seeds.first, seeds.first + seeds.count)),
@@ -302,12 +300,9 @@ def plan(study: Study) -> Plan:
     runs = []
     # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
     met = sorted({seed for case in study.cases for seed in case.training_seeds})
-    order = [
-        (seed, name, case)
-        for seed, name, case in product((None, *met), study.scenarios, study.all_cases)
-        if seed in (case.training_seeds or (None,)) and name in case.scenarios
-    ]
-    for seed, name, case in order:
+    for seed, name, case in product((None, *met), study.scenarios, study.all_cases):
+        if seed not in (case.training_seeds or (None,)) or name not in case.scenarios:
+            continue
         scenario = study.scenarios[name]
         training = None if seed is None else study.training(case, name, seed)
         if (case.name, name) not in depends:

@@ -500,8 +500,7 @@ class StudyResults(Shown):
         own = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
         names = own.case + " on " + scenario + ", seed " + own.training_seed.astype(str)
         seconds = (names + f", sample {last}").map(clock)
-        found: dict[str, float] = seconds.groupby(own.case).median().to_dict()
-        return found
+        return dict(seconds.groupby(own.case).median())
 
     def _operation(self, scenario: str) -> Figure | None:
         if scenario not in (self.about.get("operation") or {}):
@@ -527,15 +526,10 @@ class StudyResults(Shown):
 
         A section has a title and may have a note, a table, and names of figures in `figures`.
         """
-        sections: list[dict[str, Any]] = [
-            {
-                "title": f"Scenario {scenario}",
-                "note": self._noise(scenario),
-                "table": self.lines(scenario),
-                "figures": drawn[scenario],
-            }
-            for scenario in self.scenarios
-        ]
+        sections: list[dict[str, Any]] = []
+        for name in self.scenarios:
+            words = {"title": f"Scenario {name}", "note": self._noise(name)}
+            sections.append(words | {"table": self.lines(name), "figures": drawn[name]})
         if len(self.aggregate):
             table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE)
             sections.append({"title": "All scenarios", "table": table})
@@ -664,8 +658,7 @@ def document(plan: Plan) -> dict[str, Any]:
             }
             for name, scenario in definition.scenarios.items()
         }
-    found: dict[str, Any] = json.loads(json.dumps(about))
-    return found
+    return dict(json.loads(json.dumps(about)))
 
 
 @known_keywords

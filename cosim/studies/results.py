@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -362,16 +362,14 @@ class StudyResults(Shown):
             for name, (head, rows) in tables.items()
         )
 
-    def further(self) -> list[TextTable]:
+    def further(self) -> Iterator[TextTable]:
         """Title, header and rows of the tables that the study asks for beside its summary."""
-        found = []
         against = {name: case.get("against") for name, case in self.cases.items()}
         for scenario, about in (self.about.get("operation") or {}).items():
             judged, seconds = self._judged(scenario), self._seconds(scenario)
-            found += operation.tables(judged, scenario, about, against, seconds)
+            yield from operation.tables(judged, scenario, about, against, seconds)
         if "paper" in self.about["tables"]:
-            found.append(self.paper())
-        return found
+            yield self.paper()
 
     def paper(self) -> TextTable:
         """Title, header and rows: gains of each trained case's median run on every scenario.

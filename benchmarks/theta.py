@@ -30,11 +30,11 @@ def moves(planned: Plan, out: Path, case: str) -> tuple[dict[tuple[str, int], pd
     """First and last θ of each run by scenario and training seed, and the scale of each entry."""
     found, scale = {}, {}
     for run in planned.runs:
-        if run.key.case == case and run.training is not None:
-            blocks = run.training.prepare().starting_parameters().blocks
-            log = pd.read_csv(out / run.key.folder / "learning.csv").iloc[[0, -1]]
+        if run.case == case and run.training is not None:
+            blocks = run.prepared().starting_parameters().blocks
+            log = pd.read_csv(out / run.folder / "learning.csv").iloc[[0, -1]]
             theta = log[[f"theta {label}" for label in blocks.labels]]
-            found[run.key.scenario, run.key.seed] = theta.set_axis(blocks.labels, axis=1)
+            found[run.scenario.name, run.seed] = theta.set_axis(blocks.labels, axis=1)
             scale = dict(zip(blocks.labels, blocks.scale.tolist(), strict=True))
     return found, scale
 

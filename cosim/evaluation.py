@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from controllers.optimum import stored_optimum
+from cosim import statistics
 from cosim.errors import EvaluationError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
@@ -20,27 +21,7 @@ from cosim.protocols import Array, Controller, Decision
 from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, reporting, simulate
-from cosim.statistics import (
-    bootstrapped,
-    gain,
-    gains,
-    gap_closed,
-    gaps_closed,
-    magnitude,
-    mean,
-    regret,
-    regrets,
-)
-from cosim.studies.run import (
-    EVALUATION,
-    TIMING,
-    Noise,
-    Report,
-    Run,
-    RunKey,
-    Runner,
-    to_csv,
-)
+from cosim.studies.run import EVALUATION, TIMING, Noise, Report, Run, Runner, to_csv
 from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:
@@ -76,8 +57,8 @@ def evaluate(
 
     On a seed all controllers meet the same disturbances (common random numbers). A stored optimum
     runs too, for J*, without rows of its own unless it is named. Raises EvaluationError on a
-    malformed request or failed workers, StudyError on a name that no folder can have, and what
-    building or running a controller raises.
+    malformed request, a failed run or failed workers, StudyError on a name that no folder can have,
+    and what building a controller raises.
 
     Args:
         controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
@@ -120,7 +101,7 @@ def evaluate(
             "controller": item if isinstance(item, str) else _qualified(item),
             "parameters": parameters[name],
         }
-        runs.append(Run(RunKey(scenario.name, name), scenario, item, None, depends, noise))
+        runs.append(Run(scenario, name, depends, noise, item))
     total = sum(run.samples for run in runs)
     bar = reporting(progress, scenario.name, total)
     with temporary_folder("cosim-evaluation-") as own, bar as tell:
@@ -129,7 +110,7 @@ def evaluate(
             tell(0, "", line)
         runner.run(jobs, scheduler)
         for failure in runner.failures.values():
-            raise failure.error()
+            raise EvaluationError(failure.message)
         stores = dict(zip(named, runner.stores.values(), strict=True))
         columns, timing = (
             {name: store.measured(file) for name, store in stores.items()}
@@ -224,8 +205,7 @@ class Evaluation(Result):
         for word, known in ((controller, self.columns), (name, next(iter(self.columns.values())))):
             if word not in known:
                 raise EvaluationError(f"there is no '{word}'{instead(word, map(str, known))}")
-        found: Array = self.columns[controller][name].to_numpy()
-        return found
+        return np.asarray(self.columns[controller][name])
 
     def _cost(self, controller: str) -> Array:
         """J over the seeds, (S,), NaN of a controller that was not evaluated."""
@@ -238,9 +218,9 @@ class Evaluation(Result):
         cost, names = frame.J.to_numpy(), (NAIVE, OPTIMAL, self.reference)
         naive, optimal, reference = (np.tile(self._cost(n), len(self.controllers)) for n in names)
         frame["parameters_hash"] = frame.controller.map(self.parameters)
-        frame["regret"] = regrets(cost, optimal)
-        frame["gap_closed"] = gaps_closed(cost, naive, optimal)
-        frame["gain_in_J"] = gains(cost, reference)
+        frame["regret"] = statistics.regrets(cost, optimal)
+        frame["gap_closed"] = statistics.gaps_closed(cost, naive, optimal)
+        frame["gain_in_J"] = statistics.gains(cost, reference)
         return frame[COLUMNS].astype({"failures": int})
 
     def _rows(self, frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
@@ -304,32 +284,34 @@ class Evaluation(Result):
         }
 
     def _controller(self, name: str) -> dict[str, Any]:
-        estimates = {key: mean(self.column(name, key))._asdict() for key in MEANS}
+        estimates = {key: statistics.mean(self.column(name, key))._asdict() for key in MEANS}
         document: dict[str, Any] = {key: one.pop("value") for key, one in estimates.items()}
         document |= {
             "failures": int(np.sum(self.column(name, "failures"))),
             "parameters_hash": self.parameters[name],
             "intervals": estimates,
         }
-        cost, naive = self._cost(name), self._cost(NAIVE)
+        cost, best = self._cost(name), self.optimal
         if self.optimum is not None:
-            resampled = bootstrapped(cost - self.optimal, magnitude(self.optimal))
-            document["regret"] = regret(cost, self.optimal)._asdict() | {"bootstrap": resampled}
-        if self.optimum is not None and NAIVE in self.controllers:
-            document["gap_closed"] = gap_closed(cost, naive, self.optimal)._asdict()
+            resampled = statistics.bootstrapped(cost - best, statistics.magnitude(best))
+            found = statistics.regret(cost, best)._asdict()
+            document["regret"] = found | {"bootstrap": resampled}
+            if NAIVE in self.controllers:
+                gap = statistics.gap_closed(cost, self._cost(NAIVE), best)
+                document["gap_closed"] = gap._asdict()
         return document
 
     def _comparison(self, name: str, reference: str) -> dict[str, Any]:
         cost, other = self._cost(name), self._cost(reference)
-        resampled = bootstrapped(other - cost, magnitude(other))
+        resampled = statistics.bootstrapped(other - cost, statistics.magnitude(other))
         return {
             "controller": name,
             "reference": reference,
             "differences": {
-                key: mean(self.column(name, key) - self.column(reference, key))._asdict()
+                key: statistics.mean(self.column(name, key) - self.column(reference, key))._asdict()
                 for key in COMPARED
             },
-            "gain_in_J": gain(cost, other)._asdict() | {"bootstrap": resampled},
+            "gain_in_J": statistics.gain(cost, other)._asdict() | {"bootstrap": resampled},
         }
 
 

@@ -130,16 +130,11 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
     Entries at a quarter of R count with their share. Source: Agarwal et al., Deep RL at the Edge of
     the Statistical Precipice.
     """
-    ordered = np.sort(values, axis=axis)
-    count = ordered.shape[axis]
-    edges = np.arange(count + 1)
-    upper, lower = np.minimum(edges[1:], 0.75 * count), np.maximum(edges[:-1], 0.25 * count)
-    weight = np.maximum(upper - lower, 0.0)
-    shape = [1] * ordered.ndim
-    shape[axis] = count
-    with np.errstate(invalid="ignore"):
-        share = np.where(weight.reshape(shape) > 0, ordered, 0.0) * weight.reshape(shape)
-    return share.sum(axis=axis) / weight.sum()
+    ordered = np.sort(np.moveaxis(values, axis, -1))
+    count = ordered.shape[-1]
+    weight = np.diff(np.clip(np.arange(count + 1), 0.25 * count, 0.75 * count))
+    inside = np.where(weight > 0, ordered, 0.0)  # values outside may be infinite
+    return (inside * weight).sum(axis=-1) / weight.sum()
 
 
 def over_runs(strata: Sequence[Array]) -> Estimate:
@@ -168,12 +163,10 @@ def td_error_mean(
     """
     counts = np.where(np.isfinite(td_error), updates, 0.0)
     squares = np.where(counts > 0, td_error, 0.0) ** 2 * counts
-    total = np.concatenate([[0.0], np.cumsum(squares)])
-    count = np.concatenate([[0.0], np.cumsum(counts)])
-    first = np.searchsorted(np.concatenate([[0.0], samples]), samples - window, side="left")
-    last = np.arange(1, len(samples) + 1)
-    below = count[last] - count[first]
-    mean = np.maximum(total[last] - total[first], 0.0) / np.where(below > 0, below, 1.0)
+    total = np.pad(np.cumsum([squares, counts], axis=1), ((0, 0), (1, 0)))
+    first = np.searchsorted(np.append(0.0, samples), samples - window, side="left")
+    above, below = total[:, 1:] - total[:, first]
+    mean = np.maximum(above, 0.0) / np.where(below > 0, below, 1.0)
     return np.where(below > 0, np.sqrt(mean), np.nan)
 
 
@@ -212,15 +205,6 @@ def _t_interval(residuals: Array, value: float) -> Interval:
     return value - half, value + half
 
 
-def two_way(cost: Array, optimum: Array) -> Interval:
-    """Interval of the median over R runs of their regret, over runs and noise together.
-
-    `cost` (R, S) is J of each run and noise seed, `optimum` (S,) J* on the same noise. Runs and
-    noise seeds are resampled independently (percentiles). None for one seed.
-    """
-    return _two_way(cost - optimum, magnitude(optimum))
-
-
 def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float, Interval, float]:
     """Median over R pairs of runs of (J − J')/|J*|, its interval over pairs and noise, and p.
 
@@ -238,12 +222,18 @@ def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float,
         flips = 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1) - 1
     reached = np.abs(flips @ ranks) >= abs(float(np.sign(each) @ ranks)) - 1e-9
     p = (1 + reached.sum()) / (1 + len(flips)) if count > 12 else reached.mean()
-    interval = _two_way(cost - other, below)
+    interval = two_way(cost, optimum, other)
     return float(np.median(each)), interval, float(p) if count > 1 else float("nan")
 
 
-def _two_way(terms: Array, below: Array) -> Interval:
-    """Percentiles of the median over rows of mean(terms)/mean(below), both axes resampled."""
+def two_way(cost: Array, optimum: Array, other: Array | None = None) -> Interval:
+    """Interval of the median over R runs of (J − J')/|J*|, over runs and noise together.
+
+    `cost` (R, S) is J of each run and noise seed, `optimum` (S,) J* on the same noise, `other` J',
+    (R, S), else J*. Runs and noise seeds are resampled independently (percentiles). None for one
+    seed.
+    """
+    terms, below = cost - (optimum if other is None else other), magnitude(optimum)
     runs, seeds = terms.shape
     if seeds < 2:
         return None

@@ -8,37 +8,31 @@ from typing import Annotated
 import typer
 
 from cosim.cli.output import JsonOption, output
+from cosim.errors import ComparisonError
+from cosim.files import protect
 
 
 def compare(
-    a: Annotated[
-        Path, typer.Argument(help="Run: its folder, trajectory.csv or .rrd.", show_default=False)
-    ],
-    b: Annotated[Path, typer.Argument(help="Run to compare it with.", show_default=False)],
-    tolerance: Annotated[
-        list[str] | None,
-        typer.Option("--tolerance", "-t", help="NAME=VALUE in the signal's unit; repeatable."),
-    ] = None,
-    relative: Annotated[
-        float,
-        typer.Option(
-            "--relative",
-            min=0.0,
-            help="Tolerance of the others, per largest magnitude in A; the residual is left out.",
-        ),
-    ] = 0.0,
-    record: Annotated[
-        Path | None, typer.Option("--record", help="Write a Rerun recording with both overlaid.")
-    ] = None,
+    a: Path,
+    b: Path,
+    tolerance: Annotated[list[str] | None, typer.Option("--tolerance", "-t")] = None,
+    relative: Annotated[float, typer.Option(min=0.0)] = 0.0,
+    record: Path | None = None,
     json: JsonOption = False,
 ) -> None:
     """Compare two runs sample by sample; exit code 1 if they differ.
 
     Without tolerances every bit of every signal counts; wall-clock times never do.
+
+    Args:
+        a: Run: its folder, trajectory.csv or .rrd.
+        b: Run to compare it with.
+        tolerance: NAME=VALUE in the signal's unit; repeatable.
+        relative: Tolerance of the others, per largest magnitude in A; the residual is left out.
+        record: Write a Rerun recording with both overlaid.
     """
     with output(json) as out_:
         from cosim import comparison
-        from cosim.files import protect
 
         runs = comparison.load_run(a), comparison.load_run(b)
         protect(run.name for run in runs)  # of a folder, the file in it
@@ -73,8 +67,6 @@ def compare(
 
 
 def _tolerance(option: str) -> tuple[str, float]:
-    from cosim.errors import ComparisonError
-
     name, _, value = option.rpartition("=")
     try:
         return name, float(value)

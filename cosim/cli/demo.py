@@ -7,6 +7,9 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
+import typer
+
+import cosim
 from cosim.cli import output as cli
 
 SCENARIO = "fouled"
@@ -18,9 +21,7 @@ RUNS = 10
 
 
 def demo(
-    samples: Annotated[
-        int, cli.count("--samples", least=1000, most=1_000_000, text="Plant samples of learning.")
-    ] = 20_000,
+    samples: Annotated[int, typer.Option(min=1000, max=1_000_000)] = 20_000,
     steps: cli.StepsOption = 500,
     seed: cli.SeedOption = 0,
     out: cli.OutOption = Path("cosim-demo"),
@@ -31,22 +32,20 @@ def demo(
     The condenser of the evaporator is fouled and no controller is told. Writes
     evaluation.csv, evaluation.png, timing.csv, summary.json, before-after.png, demo.rrd, and of the
     training learning.csv, learning.png, training.rrd, parameters.toml and scenario.toml.
+
+    Args:
+        samples: Plant samples of learning.
     """
     with cli.output(json) as out_:
         from cosim.cli.evaluate import show
         from cosim.comparison import RunSignals
-        from cosim.evaluation import evaluate
         from cosim.figures.style import save
         from cosim.figures.trajectory import overlay_figure
         from cosim.files import temporary_folder
-        from cosim.plant import FmuPlant
-        from cosim.plugins import build_controller
         from cosim.recording import record_overlay, record_training
-        from cosim.scenario import Scenario
-        from cosim.simulation import simulate
-        from learning.training import HELD_OUT, train
+        from learning.training import HELD_OUT
 
-        scenario = Scenario.load(SCENARIO)
+        scenario = cosim.Scenario.load(SCENARIO)
         folder = cli.open_folder(out)
         out_.note(scenario.description)
         trained = {}
@@ -56,16 +55,18 @@ def demo(
         ):
             own: dict[str, Any] = {"settings": settings, "seed": seed, "start": start}
             own |= dict.fromkeys(EVERY, max(1, number // 10))
-            trained[name] = train(rule, SCENARIO, number, progress=out_.live, **own)
+            trained[name] = cosim.train(rule, SCENARIO, number, progress=out_.live, **own)
         first = 2 * HELD_OUT + seed  # noise that no training met
-        with temporary_folder("cosim-demo-") as work, FmuPlant(scenario) as plant:
+        with temporary_folder("cosim-demo-") as work, cosim.FmuPlant(scenario) as plant:
             named = {NAIVE: NAIVE, BACKED_OFF: "", LEARNT: "", OPTIMAL: OPTIMAL}
             for name, training in trained.items():
                 named[name] = str(training.parameters.save(work / f"{training.run.algorithm}.toml"))
             seeds = range(first, first + RUNS)
-            found = evaluate(scenario, named, seeds, steps, progress=out_.live)
+            found = cosim.evaluate(scenario, named, seeds, steps, progress=out_.live)
             runs = {
-                name: simulate(plant, build_controller(named[name], scenario), steps, first)
+                name: cosim.simulate(
+                    plant, cosim.build_controller(named[name], scenario), steps, first
+                )
                 for name in (NAIVE, LEARNT, OPTIMAL)
             }
         summary = found.summary()

@@ -5,41 +5,23 @@ from __future__ import annotations
 import shlex
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
-
-if TYPE_CHECKING:
-    from cosim.scenario import Scenario
+from cosim.files import write_atomically
 
 
 def evaluate(
-    controllers: Annotated[
-        list[str],
-        typer.Option(
-            "--controllers",
-            "-c",
-            help="Comma-separated, or the option again: naive, tuned, commissioned, cautious, lqr, "
-            "pi, converged, optimal, a parameters file or module:factory; NAME=… gives one another "
-            "name.",
-        ),
-    ] = ["naive"],  # noqa: B006
+    controllers: Annotated[list[str], typer.Option("--controllers", "-c")] = ["naive"],  # noqa: B006
     scenario: cli.ScenarioOption = "paper",
-    seeds: Annotated[int, cli.count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
-    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
+    seeds: Annotated[int, typer.Option(min=1, max=1_000_000)] = 10,
+    first_seed: Annotated[int, typer.Option(min=0)] = 0,
     steps: cli.StepsOption = 1000,
     out: cli.OutOption = Path("cosim-evaluation"),
-    trajectories: Annotated[
-        Path | None,
-        typer.Option(
-            "--trajectories",
-            help="In place of controllers: judge a folder of loops that another tool ran, one CSV "
-            "file a seed (run-7.csv) with the states and the actions applied.",
-            show_default=False,
-        ),
-    ] = None,
+    trajectories: Path | None = None,
     jobs: cli.JobsOption = None,
     scheduler: cli.SchedulerOption = None,
     json: cli.JsonOption = False,
@@ -48,13 +30,20 @@ def evaluate(
 
     Writes evaluation.csv (a row per controller and seed), evaluation.png, summary.json, timing.csv
     and scenario.toml. Run again with the same --out to go on after an interruption.
+
+    Args:
+        controllers: Comma-separated, or the option again: naive, tuned, commissioned, cautious,
+            lqr, pi, converged, optimal, a parameters file or module:factory; NAME=… gives one
+            another name.
+        seeds: Number of seeds.
+        first_seed: The first seed.
+        trajectories: In place of controllers: judge a folder of loops that another tool ran, one
+            CSV file a seed (run-7.csv) with the states and the actions applied.
     """
     with cli.output(json) as out_:
         from loky import cpu_count
 
-        from cosim.evaluation import evaluate as run
         from cosim.evaluation import named_controllers
-        from cosim.files import write_atomically
 
         task = cli.load_scenario(scenario)
         if trajectories is not None:
@@ -68,7 +57,7 @@ def evaluate(
         out_.announce(task.plant.fmu)
         total = (len(named) + ("optimal" not in named)) * seeds * steps
         with cli.followed(out_, f"samples on {task.name}", total) as report:
-            evaluation = run(
+            evaluation = cosim.evaluate(
                 task,
                 named,
                 range(first_seed, first_seed + seeds),
@@ -87,9 +76,8 @@ def evaluate(
         out_.json(summary, folder)
 
 
-def _judge(scenario: Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
+def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
     from cosim.evaluation import judge
-    from cosim.files import write_atomically
     from cosim.statistics import mean, regret, shown
 
     table = judge(scenario, trajectories)

@@ -7,43 +7,38 @@ from typing import Annotated, Literal
 
 import typer
 
+import cosim
 from cosim.cli.output import JsonOption, ScenarioOption, output
 
 
 def export(
-    controller: Annotated[
-        str, typer.Argument(help="naive, tuned or a parameters file (.toml) of a training.")
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="The FMU's file; with --format c a folder.")
-    ],
+    controller: str,
+    out: Annotated[Path, typer.Option("--out", "-o")],
     scenario: ScenarioOption = "paper",
-    format_: Annotated[
-        Literal["fmu", "c"], typer.Option("--format", help="fmu, or c: one .c and .h, no FMI.")
-    ] = "fmu",
-    single: Annotated[
-        bool, typer.Option("--single", help="With --format c: float in place of double.")
-    ] = False,
-    measured: Annotated[
-        str, typer.Option("--measured", help="Disturbances that are inputs, as X1,T1.")
-    ] = "",
-    fmi: Annotated[int, typer.Option("--fmi", help="FMI version: 2 or 3.", min=2, max=3)] = 2,
-    local: Annotated[
-        bool, typer.Option("--local", help="Build for this machine alone, by $CC or cc.")
-    ] = False,
-    ssp: Annotated[
-        Path | None,
-        typer.Option("--ssp", help="Write the loop with the plant here.", show_default=False),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", help="Seed of the plant in the SSP, as in cosim simulate.")
-    ] = 0,
+    format_: Annotated[Literal["fmu", "c"], typer.Option("--format")] = "fmu",
+    single: Annotated[bool, typer.Option("--single")] = False,
+    measured: str = "",
+    fmi: Annotated[int, typer.Option(min=2, max=3)] = 2,
+    local: Annotated[bool, typer.Option("--local")] = False,
+    ssp: Path | None = None,
+    seed: int = 0,
     json: JsonOption = False,
 ) -> None:
     """Write an RTI-NMPC as a self-contained co-simulation FMU, or C, that needs no Python.
 
     For Linux, Windows and macOS, x86_64 and ARM64 (pip install 'rti-cosim\\[cross]'); without that
     package, or with --local, for this machine by its C compiler. θ are tunable parameters.
+
+    Args:
+        controller: naive, tuned or a parameters file (.toml) of a training.
+        out: The FMU's file; with --format c a folder.
+        format_: fmu, or c: one .c and .h, no FMI.
+        single: With --format c: float in place of double.
+        measured: Disturbances that are inputs, as X1,T1.
+        fmi: FMI version: 2 or 3.
+        local: Build for this machine alone, by $CC or cc.
+        ssp: Write the loop with the plant here.
+        seed: Seed of the plant in the SSP, as in cosim simulate.
     """
     with output(json) as out_:
         from importlib.util import find_spec
@@ -51,7 +46,6 @@ def export(
         from cosim.cli import controller_fmu
         from cosim.errors import CosimError
         from cosim.files import check_target
-        from cosim.scenario import Scenario
         from fmus import PLATFORMS, present
         from fmus.model import FmiVersion
 
@@ -60,7 +54,7 @@ def export(
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
             if format_ == "fmu":  # before the minutes that compilers may take
                 check_target(target)
-        loaded = Scenario.load(scenario)
+        loaded = cosim.Scenario.load(scenario)
         names = tuple(dict.fromkeys(filter(None, measured.split(","))))
         if ssp is not None and (missing := set(names) - set(loaded.plant.disturbances)):
             raise CosimError(f"--ssp: the plant has no disturbance {', '.join(sorted(missing))}")

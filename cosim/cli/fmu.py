@@ -83,36 +83,25 @@ def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
 
 @app.command()
 def build(
-    folder: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Folder with modelDescription.xml and C sources of a plant of your own.",
-            show_default="the evaporator",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder for the FMUs; with FOLDER the .fmu file."),
-    ] = None,
-    platforms: Annotated[
-        Literal["here", "all"],
-        typer.Option(
-            help="here: by the local C compiler ($CC, else cc); all: 64-bit Linux and macOS on x86 "
-            "and ARM, Windows on x86, by pip install 'rti-cosim\\[cross]'."
-        ),
-    ] = "here",
-    check: Annotated[
-        bool, typer.Option("--check", help="Build for all and compare with the shipped files.")
-    ] = False,
-    in_place: Annotated[
-        bool, typer.Option("--in-place", help="Developers: rebuild the shipped files and C header.")
-    ] = False,
+    folder: Annotated[Path | None, typer.Argument(show_default="the evaporator")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
+    platforms: Literal["here", "all"] = "here",
+    check: Annotated[bool, typer.Option("--check")] = False,
+    in_place: Annotated[bool, typer.Option("--in-place")] = False,
     json: JsonOption = False,
 ) -> None:
     """Build FMUs from C sources: both evaporators, or a plant of your own.
 
     One of --out, --check and --in-place must be given. With the same compiler the bytes repeat;
     --check exits with code 1 if they differ from those shipped.
+
+    Args:
+        folder: Folder with modelDescription.xml and C sources of a plant of your own.
+        out: Folder for the FMUs; with FOLDER the .fmu file.
+        platforms: here: by the local C compiler ($CC, else cc); all: 64-bit Linux and macOS on x86
+            and ARM, Windows on x86, by pip install 'rti-cosim\\[cross]'.
+        check: Build for all and compare with the shipped files.
+        in_place: Developers: rebuild the shipped files and C header.
     """
     with output(json) as out_:
         from fmus import BuildError

@@ -45,6 +45,14 @@ PANELS = {
 """Where the help shows an option; the others are under Options."""
 
 
+def _documentation(command: object) -> tuple[str, dict[str, str]]:
+    """A command's text, with paragraphs as wide as the terminal, and those of its options."""
+    text, _, options = (getdoc(command) or "").partition("\n\nArgs:\n")
+    paragraphs = (paragraph.replace("\n", " ") for paragraph in text.split("\n\n"))
+    each = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", options, re.DOTALL | re.MULTILINE)
+    return "\n\n".join(paragraphs), {name: " ".join(words.split()) for name, words in each}
+
+
 class _Commands(TyperGroup):
     """Command group; refuses empty arguments."""
 
@@ -60,15 +68,17 @@ class _Commands(TyperGroup):
             if not {before, name} & set(OUTPUTS):
                 inputs += [word, *re.split("[,=]", word)]
         protect(inputs)
-        if {"-h", "--help"} & {*args}:
+        if ctx.resilient_parsing or {"-h", "--help"} & {*args}:  # completion says what help says
             import typer.rich_utils
 
             typer.rich_utils.RANGE_STRING = ""  # [1<=x<=100000000] takes a narrow terminal's room
             commands: list[Any] = [*self.commands.values()]
             for command in commands:
                 commands += getattr(command, "commands", {}).values()
+                described = _documentation(command.callback)[1]
                 for option in command.params:
                     option.rich_help_panel = PANELS.get(option.name, option.rich_help_panel)
+                    option.help = described.get(option.name, option.help)
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -109,7 +119,8 @@ for panel, function, example in (
     (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
     (RUN, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
-    app.command(rich_help_panel=panel, epilog=f"Example: cosim {example}")(function)
+    text, epilog = _documentation(function)[0], f"Example: cosim {example}"
+    app.command(rich_help_panel=panel, help=text, epilog=epilog)(function)
 for panel, group, name, *examples in (
     (BUILD, scenario.app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
     (LEARN, study.app, "study", "run mine.toml --out study", "plan mine.toml", "report study"),
@@ -119,11 +130,7 @@ for panel, group, name, *examples in (
     texts = [f"Example: cosim {name} {example}" for example in examples]
     app.add_typer(group, name=name, rich_help_panel=panel, epilog=texts[0])
     for command, text in zip(group.registered_commands, texts, strict=True):
-        command.epilog = text
-for group in (app, scenario.app, study.app, study.results, fmu.app):
-    for command in group.registered_commands:  # paragraphs as wide as the terminal
-        paragraphs = (getdoc(command.callback) or "").split("\n\n")
-        command.help = "\n\n".join(paragraph.replace("\n", " ") for paragraph in paragraphs)
+        command.help, command.epilog = _documentation(command.callback)[0], text
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70

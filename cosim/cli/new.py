@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Literal
 
 from cosim.cli import output as cli
 
@@ -26,13 +24,16 @@ NEXT = {
 
 def new(
     kind: Literal["rule", "controller", "plant", "study"],
-    name: Annotated[str, typer.Argument(help="Name of files, module and class.")],
+    name: str,
     out: cli.OutOption = Path(),
     json: cli.JsonOption = False,
 ) -> None:
     """Write a skeleton that runs, and print the commands; replaces no file.
 
     A rule and a controller are Python modules, a plant is C, a model and a scenario, a study TOML.
+
+    Args:
+        name: Name of files, module and class.
     """
     with cli.output(json) as out_:
         import re

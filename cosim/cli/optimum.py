@@ -8,26 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming import Optimum, Progress
     from controllers.optimum import QuasiStaticPolicy
-    from cosim.scenario import Scenario
 
 
 def optimum(
     scenario: cli.ScenarioOption = "paper",
-    refine: Annotated[
-        bool,
-        typer.Option(
-            "--refine",
-            help="Solve, refine the grid, simulate the policy; keep the certificate.",
-        ),
-    ] = False,
-    recompute: Annotated[
-        bool, typer.Option("--recompute", help="Solve even if the policy is stored.")
-    ] = False,
+    refine: Annotated[bool, typer.Option("--refine")] = False,
+    recompute: Annotated[bool, typer.Option("--recompute")] = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Mean cost per sample J* of the optimal policy, by dynamic programming, with its bounds.
@@ -36,6 +28,10 @@ def optimum(
     refinement and long simulation agree within 0.05 % and no policy search is below; else
     it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
     A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is.
+
+    Args:
+        refine: Solve, refine the grid, simulate the policy; keep the certificate.
+        recompute: Solve even if the policy is stored.
     """
     with cli.output(json) as out_:
         from controllers.optimum import QuasiStaticPolicy, change_of
@@ -51,7 +47,7 @@ def optimum(
         raise typer.Exit(1)
 
 
-def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Output) -> None:
+def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cli.Output) -> None:
     names = [name for name, value in policy.law.plants[0].items() if value is not None]
     table = [{name: plant[name] for name in names} | {"J": gain} for plant, gain in policy.gains]
     rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
@@ -63,7 +59,7 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Outp
     out_.json(document | {"table": table})
 
 
-def _solve(task: Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
+def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
     from controllers.dynamic_programming import Figure, Settings, certify, objection, solve
@@ -115,15 +111,16 @@ def _told(out_: cli.Output) -> Progress:
 
 def tuning(
     scenario: cli.ScenarioOption = "paper",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Write the tuned θ to this TOML file.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Tune the NMPC's cost by economics (controller `tuned`) and show the certificate.
 
     It says which constraint enters, the eigenvalues of the economic and of the convexified
     cost's Hessian, and the local feedback gain of both.
+
+    Args:
+        out: Write the tuned θ to this TOML file.
     """
     with cli.output(json) as out_:
         from controllers.economic import tune

@@ -9,24 +9,22 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import cosim
 from cosim.errors import CosimError
 from cosim.files import write_atomically
 from cosim.processes import Terminated, hold, redirected_output, release, watch
-
-if TYPE_CHECKING:
-    from cosim.scenario import Scenario
 
 MOST = 100_000_000
 """Samples of the longest run."""
 
 
-def count(*names: str, least: int = 1, most: int = MOST, text: str) -> Any:
-    """An option that is a number of samples, or of something else."""
-    return typer.Option(*names, min=least, max=most, help=text)
+def count(*names: str, text: str | None = None) -> Any:
+    """An option that is a number of samples."""
+    return typer.Option(*names, min=1, max=MOST, help=text)
 
 
 ScenarioOption = Annotated[
@@ -38,7 +36,8 @@ SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the dist
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")]
 RecordOption = Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")]
 JobsOption = Annotated[
-    int | None, count("--jobs", "-j", most=1024, text="Processes; default: one per core.")
+    int | None,
+    typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
 ]
 SchedulerOption = Annotated[
     str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs.")
@@ -215,14 +214,13 @@ def writable_folder(folder: Path) -> Path:
     return folder
 
 
-def load_scenario(name: str) -> Scenario:
+def load_scenario(name: str) -> cosim.Scenario:
     """Load a preset or TOML file, so that its `module:function` may lie beside it or here.
 
     Raises ScenarioError.
     """
     from cosim.plugins import import_from
-    from cosim.scenario import Scenario
 
     if Path(name).is_file():
         import_from(Path(name).resolve().parent)
-    return Scenario.load(name)
+    return cosim.Scenario.load(name)

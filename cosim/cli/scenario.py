@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer.core import TyperGroup
 
+import cosim
 from cosim.cli import output as cli
-
-if TYPE_CHECKING:
-    from cosim.scenario import Scenario
+from cosim.errors import CosimError
+from cosim.files import write_atomically
 
 
 class ShowByDefault(TyperGroup):
@@ -33,31 +33,26 @@ app = typer.Typer(
 
 @app.command()
 def show(
-    name: Annotated[
-        str | None, typer.Argument(help="Preset, random-SEED or TOML file; none lists the presets.")
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(
-            "--seed-values",
-            min=0,
-            help="Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.",
-            show_default=False,
-        ),
-    ] = None,
+    name: Annotated[str | None, typer.Argument()] = None,
+    seed: Annotated[int | None, typer.Option("--seed-values", min=0)] = None,
     json: cli.JsonOption = False,
 ) -> None:
-    """List the presets, or print a scenario with every field written out, as TOML."""
+    """List the presets, or print a scenario with every field written out, as TOML.
+
+    Args:
+        name: Preset, random-SEED or TOML file; none lists the presets.
+        seed: Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.
+    """
     with cli.output(json) as out_:
-        from cosim.scenario import Scenario, presets
+        from cosim.scenario import presets
 
         if name is None:
-            loaded = [Scenario.load(preset) for preset in presets()]
+            loaded = [cosim.Scenario.load(preset) for preset in presets()]
             rows = [(item.name, item.hash, item.description) for item in loaded]
             out_.table("presets", ("name", "hash", "description"), rows)
             out_.json({"presets": {item.name: item.hash for item in loaded}})
             return
-        chosen = Scenario.load(name)
+        chosen = cosim.Scenario.load(name)
         if seed is not None:
             values = _seed_values(chosen, seed)
             out_.note("\n".join(f"{key} = {dumps(value)}" for key, value in values.items()))
@@ -69,7 +64,7 @@ def show(
             print(f"# hash {chosen.hash}\n{chosen.to_toml()}", end="")
 
 
-def _seed_values(scenario: Scenario, seed: int) -> dict[str, float | bool | int]:
+def _seed_values(scenario: cosim.Scenario, seed: int) -> dict[str, float | bool | int]:
     from cosim.plant.fmu_plant import REALS, start_values
     from cosim.simulation import spawn_seeds
 
@@ -81,26 +76,15 @@ def _seed_values(scenario: Scenario, seed: int) -> dict[str, float | bool | int]
 
 @app.command()
 def init(
-    fmu: Annotated[str, typer.Argument(help="FMU: a path, or evaporator.", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File; default: the FMU's name, .toml.")
-    ] = None,
-    states: Annotated[str, typer.Option("--states", help="Names, comma-separated.")] = "",
-    actions: Annotated[str, typer.Option("--actions", help="Names, comma-separated.")] = "",
-    cost: Annotated[
-        str | None, typer.Option("--cost", help="Output that is the stage cost.")
-    ] = None,
-    sampling_time: Annotated[
-        float | None,
-        typer.Option("--sampling-time", min=1e-9, max=1e12, help="Sampling time in s."),
-    ] = None,
-    state: Annotated[
-        str, typer.Option("--state", help="Where to look for the steady state: numbers.")
-    ] = "",
-    action: Annotated[str, typer.Option("--action", help="The same of the actions.")] = "",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the file if it is there.")
-    ] = False,
+    fmu: str,
+    out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
+    states: str = "",
+    actions: str = "",
+    cost: str | None = None,
+    sampling_time: Annotated[float | None, typer.Option(min=1e-9, max=1e12)] = None,
+    state: str = "",
+    action: str = "",
+    overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Draft a scenario for an FMU: a commented TOML file, to be read and corrected.
@@ -108,12 +92,20 @@ def init(
     States, actions, cost, noise, ranges and what a reset can write are guessed from
     modelDescription.xml; the steady state near the start values is found by stepping the FMU,
     whose native code this runs.
+
+    Args:
+        fmu: FMU: a path, or evaporator.
+        out: File; default: the FMU's name, .toml.
+        states: Names, comma-separated.
+        actions: Names, comma-separated.
+        cost: Output that is the stage cost.
+        sampling_time: Sampling time in s.
+        state: Where to look for the steady state: numbers.
+        action: The same of the actions.
+        overwrite: Replace the file if it is there.
     """
     with cli.output(json) as out_:
-        from cosim.errors import CosimError
-        from cosim.files import write_atomically
         from cosim.plant.draft import NO_NOISE, draft_scenario
-        from cosim.scenario import Scenario
 
         target = (out or Path(f"{Path(fmu).stem}.toml")).absolute()
         if target.exists() and not overwrite:
@@ -132,7 +124,7 @@ def init(
             action=_numbers(action, "--action"),
         )
         write_atomically(target, text)
-        drafted = Scenario.load(target)
+        drafted = cosim.Scenario.load(target)
         if not json:
             print(text, end="")
         if drafted.disturbance.law == "none":
@@ -146,8 +138,6 @@ def _words(text: str) -> list[str]:
 
 
 def _numbers(text: str, option: str) -> list[float]:
-    from cosim.errors import CosimError
-
     try:
         return [float(word) for word in _words(text)]
     except ValueError:

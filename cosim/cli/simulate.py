@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
 
 DRAWN = 20_000
@@ -16,15 +17,7 @@ DRAWN = 20_000
 
 def simulate(
     scenario: cli.ScenarioOption = "paper",
-    controller: Annotated[
-        str,
-        typer.Option(
-            "--controller",
-            "-c",
-            help="naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters "
-            "file, or module:factory.",
-        ),
-    ] = "naive",
+    controller: Annotated[str, typer.Option("--controller", "-c")] = "naive",
     steps: cli.StepsOption = 1000,
     seed: cli.SeedOption = 0,
     out: cli.OutOption = Path("cosim-run"),
@@ -37,6 +30,10 @@ def simulate(
     summary.json, scenario.toml and, with --record, run.rrd.
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
+
+    Args:
+        controller: naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters
+            file, or module:factory.
     """
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -45,10 +42,8 @@ def simulate(
 
         from controllers import compile_functions
         from cosim.files import write_atomically
-        from cosim.plant import FmuPlant
-        from cosim.plugins import build_controller, parameters_hash
+        from cosim.plugins import parameters_hash
         from cosim.simulation import functions_of
-        from cosim.simulation import simulate as run
 
         loaded = cli.load_scenario(scenario)
         folder = cli.open_folder(out)
@@ -58,12 +53,13 @@ def simulate(
             from cosim.recording import RerunRecorder, spare_pandas
 
             recorder = RerunRecorder(folder / "run.rrd")
-        with FmuPlant(loaded, intermediate=recorder.intermediate if recorder else None) as plant:
-            law = build_controller(controller, loaded)
+        between = recorder.intermediate if recorder else None
+        with cosim.FmuPlant(loaded, intermediate=between) as plant:
+            law = cosim.build_controller(controller, loaded)
             compile_functions(law, steps)
             if record:  # a plug-in's own use of pandas stays
                 spare_pandas()
-            trajectory = run(plant, law, steps, seed, recorder=recorder, progress=out_.live)
+            run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=out_.live)
             summary: dict[str, Any] = {
                 "version": version("rti-cosim"),
                 "scenario": loaded.name,
@@ -73,16 +69,16 @@ def simulate(
                 "controller": controller,
                 "parameters_hash": parameters_hash(law) or None,
                 "seed": seed,
-                **trajectory.summary(),
-                "timing": trajectory.timing_summary() | {"functions": functions_of(law)},
+                **run.summary(),
+                "timing": run.timing_summary() | {"functions": functions_of(law)},
             }
         if not record:
             # A recording of another run must not stay beside this run's signals.
             (folder / "run.rrd").unlink(missing_ok=True)
-        trajectory.write_csv(folder / "trajectory.csv")
-        trajectory.write_timing_csv(folder / "timing.csv")
+        run.write_csv(folder / "trajectory.csv")
+        run.write_timing_csv(folder / "timing.csv")
         if 1 < steps <= DRAWN:
-            trajectory.plot(folder / "trajectory.png")
+            run.plot(folder / "trajectory.png")
         else:  # nor may a shorter run's stay
             (folder / "trajectory.png").unlink(missing_ok=True)
         write_atomically(folder / "scenario.toml", loaded.to_toml())
@@ -95,7 +91,7 @@ def simulate(
         ]
         rows += [
             (f"{name} time, median / 99 %", f"{t['median_us']:.1f} / {t['p99_us']:.1f} µs")
-            for name, t in trajectory.timing_summary().items()
+            for name, t in run.timing_summary().items()
         ]
         title = f"{controller} on {loaded.name}, {steps} samples, seed {seed}"
         out_.table(title, ("per sample", "value"), rows)

@@ -4,27 +4,16 @@ from __future__ import annotations
 
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
-
-if TYPE_CHECKING:
-    from cosim.studies.results import StudyResults
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 results = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
 
-ColumnsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--columns",
-        help="Columns of the printed tables, by comma, or `all`: case, rank, samples, finished, "
-        "regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against, difference, "
-        "p; default: case,rank,regret,worst,finished.",
-    ),
-]
 FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 NamesArgument = Annotated[
     list[str] | None, typer.Argument(help="Studies; default: all that apply.")
@@ -60,22 +49,21 @@ def _execute(
     jobs: int | None,
     scheduler: str | None = None,
     figures: bool = True,
-) -> StudyResults:
+) -> cosim.StudyResults:
     """Run a study with a progress bar; exits with code 1 where runs failed."""
     from loky import cpu_count
 
     from cosim.errors import FailedRunsError
-    from cosim.studies.plan import Study, plan
-    from cosim.studies.results import study
+    from cosim.studies.plan import plan
 
-    definition = Study.load(file)
+    definition = cosim.Study.load(file)
     folder = cli.open_folder(out)
     for scenario in definition.scenarios.values():
         out_.announce(scenario.plant.fmu)
     planned = plan(definition)
     with cli.followed(out_, definition.name, planned.samples) as report:
         try:
-            return study(
+            return cosim.study(
                 definition,
                 folder,
                 jobs=jobs or cpu_count(),
@@ -85,9 +73,8 @@ def _execute(
                 figures=figures,
             )
         except FailedRunsError as error:
-            failure = error
-    out_.note(f"failed: {failure}")
-    raise typer.Exit(1)
+            out_.note(f"failed: {error}")
+            raise typer.Exit(1) from None
 
 
 @app.command("plan")
@@ -96,11 +83,11 @@ def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
     with cli.output(json) as out_:
         import pandas as pd
 
-        from cosim.studies.plan import Study, plan
+        from cosim.studies.plan import plan
 
-        planned = plan(Study.load(file))
+        planned = plan(cosim.Study.load(file))
         runs = pd.DataFrame(
-            [(run.key.scenario, run.key.case, 1, run.samples) for run in planned.runs],
+            [(run.scenario.name, run.case, 1, run.samples) for run in planned.runs],
             columns=["scenario", "case", "runs", "plant samples"],
         )
         rows = runs.groupby(["scenario", "case"], sort=False, as_index=False).sum()
@@ -114,29 +101,33 @@ def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
 
 @app.command()
 def report(
-    folder: Annotated[Path, typer.Argument(help="Folder of a study.", show_default=False)],
-    columns: ColumnsOption = None,
+    folder: Path,
+    columns: str | None = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
 
     Of an unfinished study the finished runs are reported; a stored study may be reported, too.
+
+    Args:
+        folder: Folder of a study.
+        columns: Columns of the printed tables, by comma, or `all`: case, rank, samples, finished,
+            regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against,
+            difference, p; default: case,rank,regret,worst,finished.
     """
     with cli.output(json) as out_:
-        from cosim.studies.results import StudyResults
-
-        found = StudyResults.load(folder)
+        found = cosim.StudyResults.load(folder)
         page = found.report()
         _show(found, out_, columns)
         out_.note(f"the report is {page.resolve()}")
         out_.json({"report": str(page), "runs": len(found.runs)})
 
 
-def _summary(found: StudyResults) -> dict[str, Any]:
+def _summary(found: cosim.StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is timing.csv by run."""
     from cosim.studies.run import TIMING, read_table
 
-    timing = read_table(found.folder / TIMING, types={"run": str})
+    timing = read_table(found.folder / TIMING, needed=["run"])
     return {
         **found.about,
         "summary": found.summary.to_dict("records"),
@@ -145,7 +136,7 @@ def _summary(found: StudyResults) -> dict[str, Any]:
     }
 
 
-def _show(found: StudyResults, out_: cli.Output, columns: str | None = None) -> None:
+def _show(found: cosim.StudyResults, out_: cli.Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
     from cosim.studies.report import COLUMNS, SHORT
 
@@ -155,12 +146,7 @@ def _show(found: StudyResults, out_: cli.Output, columns: str | None = None) -> 
 
 
 def reproduce(
-    budget: Annotated[
-        Literal["quick", "full"],
-        typer.Option(
-            "--budget", help="quick: minutes on 2 cores; full: hours, with more seeds and samples."
-        ),
-    ] = "quick",
+    budget: Literal["quick", "full"] = "quick",
     out: cli.OutOption = Path("cosim-reproduction"),
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
@@ -170,6 +156,9 @@ def reproduce(
     A study (results/reproduce.toml, results/reproduce-full.toml): writes report.html and report.md
     with the paper's comparison at each reading of its open points and the paper's figure, and the
     tables of `cosim study run`. Run again with the same --out to go on after an interruption.
+
+    Args:
+        budget: quick: minutes on 2 cores; full: hours, with more seeds and samples.
     """
     with cli.output(json) as out_:
         from cosim.studies.stored import stored_results
@@ -186,15 +175,7 @@ def reproduce(
 @results.command()
 def check(
     names: NamesArgument = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            "--results",
-            help="Folder with the studies and tolerances.toml; default: ./results, else the "
-            "installed ones.",
-            show_default=False,
-        ),
-    ] = None,
+    folder: Annotated[Path | None, typer.Option("--results")] = None,
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
@@ -202,11 +183,14 @@ def check(
 
     Exit code 1 where a signal differs by more than its tolerance, with the first row that differs;
     2 where a stored table is missing or damaged. Writes nothing.
+
+    Args:
+        folder: Folder with the studies and tolerances.toml; default: ./results, else the installed
+            ones.
     """
     with cli.output(json) as out_:
         from cosim.files import temporary_folder
         from cosim.studies import stored
-        from cosim.studies.results import StudyResults
 
         local = Path("results")
         folder = folder or (local if local.is_dir() else stored.stored_results())
@@ -214,7 +198,7 @@ def check(
         checked = [name for name, table in studies.items() if table.check]
         quick = stored.chosen(studies, names or checked)
         for name in quick:
-            StudyResults.load(folder / name)
+            cosim.StudyResults.load(folder / name)
         found: dict[str, list[str]] = {}
         with temporary_folder("cosim-results-") as work:
             for name in quick:
@@ -233,15 +217,16 @@ def check(
 @results.command()
 def update(
     names: NamesArgument = None,
-    folder: Annotated[
-        Path, typer.Option("--results", help="Folder with the studies and tolerances.toml.")
-    ] = Path("results"),
+    folder: Annotated[Path, typer.Option("--results")] = Path("results"),
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Run studies and store their tables, figures and reports, and the folder's README.
 
     What long studies have finished is kept in the folder's `.work`; run again to go on.
+
+    Args:
+        folder: Folder with the studies and tolerances.toml.
     """
     with cli.output(json) as out_:
         from cosim.studies import stored

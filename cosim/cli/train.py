@@ -18,77 +18,25 @@ FILES = (
 
 
 def train(
-    algorithm: Annotated[
-        str, typer.Option("--algorithm", "-a", help="A registered one or module:Class.")
-    ],
+    algorithm: Annotated[str, typer.Option("--algorithm", "-a")],
     scenario: cli.ScenarioOption = "paper",
-    samples: Annotated[
-        int | None,
-        cli.count("--samples", "-n", text="Plant samples; default: the algorithm's, or 50 000."),
-    ] = None,
-    seed: Annotated[
-        int, cli.count("--seed", least=0, most=999_999, text="Seed of noise and exploration.")
-    ] = 0,
-    start: Annotated[
-        str,
-        typer.Option(
-            "--start",
-            help="Where θ starts: naive, tuned, commissioned, cautious or a parameters file.",
-        ),
-    ] = "naive",
+    samples: Annotated[int | None, cli.count("--samples", "-n")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=999_999)] = 0,
+    start: str = "naive",
     out: cli.OutOption = Path("cosim-train"),
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Go on from the folder's checkpoint."),
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Begin anew where the folder holds another run.")
-    ] = False,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Hyperparameter as name=value; may be repeated."),
-    ] = None,
-    explain: Annotated[
-        bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")
-    ] = False,
-    controller: Annotated[
-        str, typer.Option("--controller", help="What carries θ: rti or converged.")
-    ] = "rti",
-    log_every: Annotated[
-        int | None,
-        cli.count(
-            "--log-every", text="Samples per row of the log; default: 1000, or what fits the next."
-        ),
-    ] = None,
-    evaluate_every: Annotated[
-        int | None,
-        cli.count("--evaluate-every", text="Samples per greedy evaluation; default: about 5000."),
-    ] = None,
-    checkpoint_every: Annotated[
-        int | None,
-        cli.count("--checkpoint-every", text="Samples per checkpoint; default: about 5000."),
-    ] = None,
-    evaluation_seeds: Annotated[
-        int, cli.count("--evaluation-seeds", most=1_000_000, text="Held-out runs per evaluation.")
-    ] = 4,
-    evaluation_steps: Annotated[
-        int, cli.count("--evaluation-steps", text="Samples of each of them.")
-    ] = 500,
-    divergence: Annotated[
-        float,
-        typer.Option(
-            "--divergence", min=1.0, help="Times the start's J at which a run has diverged."
-        ),
-    ] = 1.5,
-    rest_after: Annotated[
-        int | None,
-        cli.count(
-            "--rest-after", text="Samples after which θ stays and nothing explores; default: never."
-        ),
-    ] = None,
-    gif: Annotated[
-        bool, typer.Option("--gif", help="Draw learning.gif too: the loop while θ is learnt.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
+    assignments: Annotated[list[str] | None, typer.Option("--set")] = None,
+    explain: Annotated[bool, typer.Option("--explain")] = False,
+    controller: str = "rti",
+    log_every: Annotated[int | None, cli.count()] = None,
+    evaluate_every: Annotated[int | None, cli.count()] = None,
+    checkpoint_every: Annotated[int | None, cli.count()] = None,
+    evaluation_seeds: Annotated[int, typer.Option(min=1, max=1_000_000)] = 4,
+    evaluation_steps: Annotated[int, cli.count()] = 500,
+    divergence: Annotated[float, typer.Option(min=1.0)] = 1.5,
+    rest_after: Annotated[int | None, cli.count()] = None,
+    gif: Annotated[bool, typer.Option("--gif")] = False,
     record: cli.RecordOption = False,
     json: cli.JsonOption = False,
 ) -> None:
@@ -96,6 +44,25 @@ def train(
 
     Exit code 1: learning diverged; the files hold the θ that the run ended with and the summary
     says why.
+
+    Args:
+        algorithm: A registered one or module:Class.
+        samples: Plant samples; default: the algorithm's, or 50 000.
+        seed: Seed of noise and exploration.
+        start: Where θ starts: naive, tuned, commissioned, cautious or a parameters file.
+        resume: Go on from the folder's checkpoint.
+        overwrite: Begin anew where the folder holds another run.
+        assignments: Hyperparameter as name=value; may be repeated.
+        explain: List the algorithm's hyperparameters and stop.
+        controller: What carries θ: rti or converged.
+        log_every: Samples per row of the log; default: 1000, or what fits the next.
+        evaluate_every: Samples per greedy evaluation; default: about 5000.
+        checkpoint_every: Samples per checkpoint; default: about 5000.
+        evaluation_seeds: Held-out runs per evaluation.
+        evaluation_steps: Samples of each of them.
+        divergence: Times the start's J at which a run has diverged.
+        rest_after: Samples after which θ stays and nothing explores; default: never.
+        gif: Draw learning.gif too: the loop while θ is learnt.
     """
     given = locals()
     with cli.output(json) as out_:

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from cosim.cli.output import JsonOption, output
 
 
 def view(
-    file: Annotated[Path, typer.Argument(help="Recording (.rrd).", show_default=False)],
-    png: Annotated[
-        Path | None, typer.Option("--png", help="Draw it to a PNG instead; needs no screen.")
-    ] = None,
-    at: Annotated[
-        float | None,
-        typer.Option(
-            "--at",
-            help="Cursor of the PNG: time in s (training: sample); default: the worst violation of "
-            "a run, or the end.",
-        ),
-    ] = None,
+    file: Path,
+    png: Path | None = None,
+    at: float | None = None,
     json: JsonOption = False,
 ) -> None:
-    """Open a recording in the Rerun viewer, draw it to a PNG, or (--json) print what it holds."""
+    """Open a recording in the Rerun viewer, draw it to a PNG, or (--json) print what it holds.
+
+    Args:
+        file: Recording (.rrd).
+        png: Draw it to a PNG instead; needs no screen.
+        at: Cursor of the PNG: time in s (training: sample); default: the worst violation of a run,
+            or the end.
+    """
     with output(json) as out:
         from cosim.errors import CosimError
         from cosim.recording import open_viewer, render, summarise

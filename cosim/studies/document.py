@@ -29,11 +29,6 @@ class SeedsTable(Table):
     first: Seed = 0
     count: Count = 10
 
-    @property
-    def seeds(self) -> range:
-        """The seeds."""
-        return range(self.first, self.first + self.count)
-
 
 class EvaluationTable(Table):
     """Noise on which controllers and learnt θ are compared, the same for all of them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,6 @@ from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, Dots, EndLabel, Look, palette, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
-from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
 from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import regrets, td_error_mean
@@ -54,23 +53,12 @@ def regret_figure(rows: Sequence[Dots], looks: Mapping[str, Look]) -> Figure:
     return drawn
 
 
-class LearningCurve(NamedTuple):
-    """Curves of R runs at K samples: `samples` (K,), `training` and `greedy` (R, K).
+def learning_curve(log: pd.DataFrame, best: float | None) -> dict[str, Array]:
+    """R runs of a case at their K greedy evaluations, as regret in % where J* is known.
 
-    `training` is the mean cost of the training samples since the point before, `greedy` that of
-    the policy learnt so far.
-    """
-
-    samples: Array
-    training: Array
-    greedy: Array
-
-
-def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
-    """The runs of a case at their greedy evaluations, as regret in % where J* is known.
-
-    `log` has rows (training_seed, samples, J, greedy_J). A run that diverged is held at its last
-    point.
+    `samples` (K,); `training` (R, K), the mean cost of the training samples since the point before;
+    `greedy` (R, K), that of the policy learnt so far. `log` has rows (training_seed, samples, J,
+    greedy_J). A run that diverged is held at its last point.
     """
     runs = []
     for _, rows in log.groupby("training_seed", sort=False):
@@ -83,11 +71,11 @@ def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
     count = longest.shape[1]
     held = np.array([np.pad(run, ((0, 0), (0, count - run.shape[1])), mode="edge") for run in runs])
     shown = held[:, 1:] if best is None else 100 * regrets(held[:, 1:], best)
-    return LearningCurve(longest[0], shown[:, 0], shown[:, 1])
+    return {"samples": longest[0], "training": shown[:, 0], "greedy": shown[:, 1]}
 
 
 def curves_figure(
-    curves: Mapping[str, LearningCurve],
+    curves: Mapping[str, Mapping[str, Array]],
     levels: Mapping[str, float],
     looks: Mapping[str, Look],
     *,
@@ -112,9 +100,9 @@ def curves_figure(
             for axes, (start, names) in zip(row, starts.items(), strict=True):
                 lines, own = [], palette(names)
                 for name in names:
-                    curve, values = curves[name], getattr(curves[name], kind.split()[0])
+                    curve, values = curves[name], curves[name][kind.split()[0]]
                     finite = np.isfinite(values).all(axis=0)
-                    samples, values = curve.samples[finite], values[:, finite]
+                    samples, values = curve["samples"][finite], values[:, finite]
                     if not values.size:
                         continue
                     low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
@@ -134,7 +122,7 @@ def curves_figure(
                     row[0], "y", np.concatenate([axes.dataLim.intervaly for axes in row])
                 )
             row[0].set_ylabel(f"{unit} of the {kind}")
-        end = max(float(curve.samples[-1]) for curve in curves.values())
+        end = max(float(curve["samples"][-1]) for curve in curves.values())
         for axes in grid[1]:
             style.samples_axis(axes, end, "training samples")
         if len(starts) > 1:
@@ -215,9 +203,9 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
     for name, scenario in plan.definition.scenarios.items():
         for table in plan.definition.table.trajectory:
             runs = {
-                run.key.case: run
+                run.case: run
                 for run in plan.runs
-                if run.key.scenario == name and (out / run.kept.get(table.file, "?")).is_file()
+                if run.scenario.name == name and (out / run.kept.get(table.file, "?")).is_file()
             }
             found = {
                 case: replace(read_csv(out / run.kept[table.file], scenario), controller=case)
@@ -246,13 +234,10 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
 
 def increments(log: pd.DataFrame) -> dict[str, Array]:
     """θ less its first row by block, (K, entries), of a training's log."""
-    theta = log[[name for name in log if name.startswith(PREFIX)]].astype(float)
+    theta = log.filter(like=PREFIX).astype(float)
+    moved = (theta - theta.iloc[0]).T
     blocks = [str(name).removeprefix(PREFIX).partition("[")[0] for name in theta]
-    moved = theta.to_numpy() - theta.to_numpy()[:1]
-    return {
-        block: moved[:, [i for i, other in enumerate(blocks) if other == block]]
-        for block in dict.fromkeys(blocks)
-    }
+    return {str(block): own.to_numpy().T for block, own in moved.groupby(blocks, sort=False)}
 
 
 def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure:
@@ -371,11 +356,9 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
 
 
 def _policy(run: Run, out: Path) -> Policy:
-    controller: Controller = (
-        build_controller(run.controller, run.scenario)
-        if run.training is None
-        else run.training.controller((out / run.key.folder / PARAMETERS).read_text("utf-8"))
-    )
+    trained = run.training is not None
+    theta = (out / run.folder / PARAMETERS).read_text("utf-8") if trained else ""
+    controller: Controller = run.policy(theta)
 
     def act(s: Array) -> Array:
         controller.reset()

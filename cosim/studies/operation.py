@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from time import process_time
 from typing import Any, NamedTuple
 
@@ -201,7 +201,7 @@ def tables(
     about: Mapping[str, Any],
     against: Mapping[str, str | None],
     seconds: Mapping[str, float],
-) -> list[TextTable]:
+) -> Iterator[TextTable]:
     """Title, header and rows of a scenario's tables.
 
     `about` holds its `sampling_time` and the samples of the `columns`; `against` the counterpart
@@ -209,7 +209,6 @@ def tables(
     """
     marks, lives = about["columns"], found.lives
     times = [duration(mark * about["sampling_time"]) for mark in marks]
-    result: list[TextTable] = []
     for name, title in (
         ("regret", "Greedy regret in % of the θ that a run would hand over, median (worst)"),
         ("life_regret", "Regret in % of the run so far, exploration included, median (worst)"),
@@ -221,8 +220,9 @@ def tables(
             [case, *(f"{_percent(row['median'][m])} ({_percent(row['max'][m])})" for m in marks)]
             for case, row in grid.iterrows()
         ]
-        result.append((f"{title}: `{scenario}`", ("case", *times), rows))
-    last = lives[lives.samples == marks[-1]].groupby("case", sort=False)
+        yield f"{title}: `{scenario}`", ("case", *times), rows
+    end = lives[lives.samples == marks[-1]]
+    last = end.groupby("case", sort=False)
     header = (
         "case", "runs", "first change, samples", "violating % since", "dearest 100 samples %",
         "updates", "model samples", "processor s",
@@ -237,18 +237,17 @@ def tables(
         ]
         for case, row in middle.iterrows()
     ]  # fmt: skip
-    result.append((f"What {times[-1]} of operation took on `{scenario}`, medians", header, rows))
-    shifts = lives[(lives.samples == marks[-1]) & lives.dearer.notna()].groupby("case", sort=False)
+    yield f"What {times[-1]} of operation took on `{scenario}`, medians", header, rows
     rows = [
         [str(case), str(len(own)), f"{_whole(own.dearer.median())} ({_whole(own.dearer.max())})",
          f"{100 * own.excess.median():.2f} ({100 * own.excess.max():.2f})"]
-        for case, own in shifts
+        for case, own in end[end.dearer.notna()].groupby("case", sort=False)
     ]  # fmt: skip
     if rows:
         title = (
             f"Shifts of {SHIFT} samples dearer than θ as it starts, median (worst): `{scenario}`"
         )
-        result.append((title, ("case", "runs", "shifts", "largest excess %"), rows))
+        yield title, ("case", "runs", "shifts", "largest excess %"), rows
     rows = []
     for case, other in against.items():
         pairs = [found.greedy.get(str(name), {}) for name in (case, other)]
@@ -264,8 +263,7 @@ def tables(
             rows.append(line)
     if rows:
         title = f"Greedy regret less the counterpart's, percentage points [95 %]: `{scenario}`"
-        result.append((title, ("case", *times), rows))
-    return result
+        yield title, ("case", *times), rows
 
 
 def _percent(share: float) -> str:

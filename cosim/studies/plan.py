@@ -16,21 +16,11 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
 from cosim.scenario import Scenario, resolved
 from cosim.studies.document import DEFAULT, CaseTable, StudyTable, read
-from cosim.studies.run import (
-    EVALUATION,
-    GREEDY,
-    LOG,
-    PARAMETERS,
-    Noise,
-    Run,
-    RunKey,
-    TrainingTask,
-    safe,
-)
+from cosim.studies.run import EVALUATION, GREEDY, LOG, PARAMETERS, Noise, Run, safe
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training import HELD_OUT
+from learning.training import HELD_OUT, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS = "trajectories", "logs"
@@ -142,8 +132,8 @@ class Study:
             for source in sources if isinstance(sources, list) else [sources]:
                 own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
                 name = f"{table.name}({own})" if table.name and sources[1:] else table.name or own
-                group, file = table.group or BASELINES, self._file(source)
-                yield Case(name, scenarios, group, controller=file, against=table.against)
+                group = table.group or BASELINES
+                yield Case(name, scenarios, group, controller=source, against=table.against)
             return
         given = {"samples": table.samples, "start": table.start, "nmpc": table.nmpc}
         axes: dict[str, list[Any]]
@@ -152,6 +142,7 @@ class Study:
         if empty := [key for key, values in axes.items() if not values]:
             raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
         varied = [key for key, values in axes.items() if len(values) > 1]
+        seeds = table.training_seeds or self.table.training_seeds
         for values in product(*axes.values()):
             point = dict(zip(axes, values, strict=True))
             label = " ".join(f"{key}={_text(point[key])}" for key in varied)
@@ -160,19 +151,16 @@ class Study:
                 scenarios=scenarios,
                 group=table.group or table.algorithm.rpartition(":")[2],
                 algorithm=table.algorithm,
-                samples=point.pop("samples"),
-                start=self._file(point.pop("start")),
-                nmpc=point.pop("nmpc"),
+                **{axis: point.pop(axis) for axis in given},
                 settings=point,
                 training=dict(table.training),
-                training_seeds=tuple((table.training_seeds or self.table.training_seeds).seeds),
+                training_seeds=tuple(range(seeds.first, seeds.first + seeds.count)),
                 against=table.against,
             )
 
-    def _file(self, source: str) -> str:
-        """A relative path from the study's folder; other names unchanged."""
-        is_file = source.endswith(".toml") and not Path(source).is_absolute()
-        return str(self.folder / source) if is_file else source
+    def located(self, source: str) -> str:
+        """A parameters file's path, given from the study's folder; other names as they are."""
+        return str(self.folder / source) if source.endswith(".toml") else source
 
     def counterpart(self, case: Case) -> str | None:
         """Name of the case that a case's paired difference is taken from; raises StudyError.
@@ -224,12 +212,6 @@ class Study:
         """A controller's name in the tables: the one that the study gives, else its own."""
         return next((c.name for c in self.cases if c.controller == controller), controller)
 
-    def relative(self, path: str) -> str:
-        """A parameters file by its path from the study, so that results depend on no folder."""
-        if not path.endswith(".toml") or self.folder not in Path(path).parents:
-            return path
-        return Path(path).relative_to(self.folder).as_posix()
-
     def noise(self, scenario: str) -> Noise:
         """Noise on which the cases of a scenario are compared."""
         table = self.table.evaluation
@@ -264,8 +246,8 @@ class Study:
             raise StudyError(f"{field}: has no number for '{scenario}', and no '{DEFAULT}'")
         return number
 
-    def training(self, case: Case, scenario: str, seed: int) -> TrainingTask:
-        """The training of a case on a scenario with one seed; raises ConfigurationError."""
+    def training(self, case: Case, scenario: str, seed: int) -> dict[str, Any]:
+        """The `training` of a case's run on a scenario; raises ConfigurationError."""
         assert case.algorithm is not None
         curves, samples = self.held_out(scenario), case.samples
         if marks := self.marks(scenario):
@@ -278,7 +260,7 @@ class Study:
         between = max(1, samples // self.table.curves.points)
         rows = -(-between // ROW)
         log_every = max(1, between // rows)
-        own = {"seed": seed, "controller": case.nmpc, "start": case.start}
+        own = {"seed": seed, "controller": case.nmpc, "start": self.located(case.start)}
         if twice := sorted(own.keys() & case.training):
             raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
         options = {
@@ -290,8 +272,8 @@ class Study:
             "evaluation_steps": curves.steps,
             **case.training,
         }
-        described, settings = self.scenarios[scenario], dict(case.settings)
-        return TrainingTask(case.algorithm, described, samples, settings, options)
+        found = {"algorithm": case.algorithm, "samples": samples}
+        return found | {"settings": dict(case.settings), "options": options}
 
 
 @dataclass(frozen=True)
@@ -318,12 +300,9 @@ def plan(study: Study) -> Plan:
     runs = []
     # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
     met = sorted({seed for case in study.cases for seed in case.training_seeds})
-    order = [
-        (seed, name, case)
-        for seed, name, case in product((None, *met), study.scenarios, study.all_cases)
-        if seed in (case.training_seeds or (None,)) and name in case.scenarios
-    ]
-    for seed, name, case in order:
+    for seed, name, case in product((None, *met), study.scenarios, study.all_cases):
+        if seed not in (case.training_seeds or (None,)) or name not in case.scenarios:
+            continue
         scenario = study.scenarios[name]
         training = None if seed is None else study.training(case, name, seed)
         if (case.name, name) not in depends:
@@ -331,19 +310,14 @@ def plan(study: Study) -> Plan:
             if ":" in (case.controller or ""):
                 build_controller(case.target, scenario)
             if training is not None:
-                training.prepare()
+                prepare(scenario=scenario, **training)
             parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
-            depends[case.name, name] = depends_on(scenario, *parts)
+            depends[case.name, name] = depends_on(scenario, *map(study.located, parts))
         facts: dict[str, Any] = {**depends[case.name, name], "fmu": plants[name]["fmu"]}
         if training is None:
-            facts["controller"] = study.relative(case.controller or "")
-        else:
-            facts["training"] = {
-                "algorithm": training.algorithm,
-                "samples": training.samples,
-                "settings": training.settings,
-                "options": {**training.options, "start": study.relative(case.start)},
-            }
+            facts["controller"] = case.controller
+        else:  # as the file says, so that results depend on no folder
+            facts["training"] = training | {"options": training["options"] | {"start": case.start}}
         judged = training is not None or case.name == study.optima.get(name)
         marks = study.marks(name) if judged else ()
         noise = {EVALUATION: (own := study.noise(name))}
@@ -369,8 +343,8 @@ def plan(study: Study) -> Plan:
         seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
         if training is None and seeds:  # the optimum, on the noise of the training seeds
             noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
-        key = RunKey(name, case.name, seed)
-        runs.append(Run(key, scenario, case.controller, training, facts, noise, kept, marks))
+        source = study.located(case.controller or "") or None
+        runs.append(Run(scenario, case.name, facts, noise, source, seed, training, kept, marks))
     _check_names(study)
     about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})

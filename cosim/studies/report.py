@@ -92,10 +92,7 @@ def rendered(template: str, **context: Any) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {
-        "markdown": lambda table: markdown_table(table[1], table[2]),
-        "command": shlex.join,
-    }
+    environment.filters |= {"markdown": lambda table: markdown_table(*table), "command": shlex.join}
     return environment.get_template(template).render(context)
 
 

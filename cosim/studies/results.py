@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from itertools import product
@@ -15,23 +15,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
 from cosim.figures.style import Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
 from cosim.simulation import reporting
-from cosim.statistics import (
-    Estimate,
-    gain,
-    gap_closed,
-    over_runs,
-    paired_difference,
-    regret,
-    regrets,
-    shown,
-    two_way,
-)
+from cosim.statistics import Estimate, over_runs, paired_difference, shown, two_way
 from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
 from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
@@ -47,18 +38,25 @@ from cosim.studies.run import (
     read_table,
     safe,
     to_csv,
+    typed,
 )
 from cosim.validation import instead, known_keywords
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
-OPERATION = "operation.csv"
+TABLES, OPERATION = (RUNS, EVALUATION, CURVES), "operation.csv"
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]
-LIVES = [*KEYS, "samples", *operation.LIFE]
-CURVE = ["samples", "J", "greedy_J", "td_error"]
-SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios")
+MEASURED = {
+    RUNS: STATE,
+    EVALUATION: [*KEYS, "seed", "steps", *INDICATORS],
+    CURVES: [*KEYS, "samples", "J", "greedy_J", "td_error"],
+    OPERATION: [*KEYS, "samples", *operation.LIFE],
+    GREEDY: [*KEYS, "samples", "seed", "J"],
+}
+"""Columns of the tables that runs give; `TABLES` are those of every study."""
+SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
 """What study.json says of a case as it is."""
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
@@ -108,13 +106,8 @@ class StudyResults(Shown):
         about = read_json(path, f"'{path}'", StudyError)
         if about.get("schema") != SCHEMA:
             raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
-        return cls(
-            folder,
-            about,
-            read_table(folder / RUNS, STATE, {"samples": int, "plant_samples": int}),
-            read_table(folder / EVALUATION, [*KEYS, "seed", "steps", *INDICATORS], {"steps": int}),
-            read_table(folder / CURVES, [*KEYS, *CURVE], {"samples": "Int64"}),
-        )
+        tables = {name: read_table(folder / name, MEASURED[name]) for name in TABLES}
+        return cls(folder, about, *tables.values())
 
     @classmethod
     def written(
@@ -127,30 +120,24 @@ class StudyResults(Shown):
         cases = [case.name for case in planned.definition.all_cases]
         places = {key: i for i, key in enumerate(product(planned.definition.scenarios, cases))}
         runs = [store for store in stores if store.sealed]  # by training seed
-        runs.sort(key=lambda store: places[store.run.key.scenario, store.run.key.case])
-        found = cls(out, document(planned), *_frames(runs))
+        runs.sort(key=lambda store: places[store.run.scenario.name, store.run.case])
         for run in planned.runs:
             for name, target in run.kept.items():
-                if (source := out / run.key.folder / name).is_file():
+                if (source := out / run.folder / name).is_file():
                     (out / target).parent.mkdir(parents=True, exist_ok=True)
                     write_atomically(out / target, source.read_bytes())
-        drawn = figures.draw(planned, out) if draw else []
-        tables = {
-            EVALUATION: found.evaluation,
-            CURVES: found.curves,
-            RUNS: found.runs,
-            SUMMARY: found.summary,
-            TIMING: _timing(stores),
-        }
-        if found.about.get("operation"):
-            tables[OPERATION], tables[GREEDY] = _lives(runs)
+        tables, about = _measured(runs), document(planned)
+        about["pictures"] = figures.draw(planned, out) if draw else []
+        found = cls(out, about, *(tables[name] for name in TABLES))
+        if not about.get("operation"):
+            del tables[OPERATION], tables[GREEDY]
+        tables |= {RUNS: found.runs, SUMMARY: found.summary, TIMING: _timing(stores)}
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
             write_atomically(out / name, to_csv(table))
-        about = dict(found.about) | {"pictures": drawn}
         write_atomically(out / ABOUT, json.dumps(about, indent=1, sort_keys=True) + "\n")
-        return replace(found, about=about)
+        return found
 
     @property
     def name(self) -> str:
@@ -166,11 +153,6 @@ class StudyResults(Shown):
     def cases(self) -> dict[str, dict[str, Any]]:
         """Cases by name, in the study's order: group, target, trained, samples, settings, …."""
         return {case["name"]: case for case in self.about["cases"]}
-
-    @property
-    def trained(self) -> list[str]:
-        """Names of the cases with an algorithm."""
-        return [name for name, case in self.cases.items() if case["trained"]]
 
     @property
     def baselines(self) -> list[str]:
@@ -209,14 +191,15 @@ class StudyResults(Shown):
         """(J − J*)/|J*| of the mean of `runs` (from 0), paired over noise seeds; NaN without J*."""
         best = self.reference("optimum", scenario)
         cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
-        return Estimate(np.nan) if best is None else regret(cost, best)
+        return Estimate(np.nan) if best is None else statistics.regret(cost, best)
 
     def gap_closed(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
         """(J_naive − J)/(J_naive − J*), likewise."""
         best, naive = (self.reference(kind, scenario) for kind in ("optimum", "naive"))
         if best is None or naive is None:
             return Estimate(np.nan)
-        return gap_closed(self.indicator(case, scenario)[list(runs)].mean(axis=0), naive, best)
+        cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
+        return statistics.gap_closed(cost, naive, best)
 
     @cached_property
     def runs(self) -> pd.DataFrame:
@@ -321,11 +304,6 @@ class StudyResults(Shown):
             return np.full(len(runs), np.nan)
         return np.where(np.isfinite(runs.J), runs.regret, np.inf)
 
-    @property
-    def known(self) -> list[str]:
-        """Scenarios whose J* is known."""
-        return [s for s in self.scenarios if self.reference("optimum", s) is not None]
-
     @cached_property
     def aggregate(self) -> pd.DataFrame:
         """Regret over all runs of cases that ran on all (several) scenarios with known J*.
@@ -333,8 +311,9 @@ class StudyResults(Shown):
         The bootstrap is stratified: runs are resampled within their scenario.
         """
         rows: list[dict[str, Any]] = []
-        for case in self.cases if len(self.known) > 1 else ():
-            strata = [self.regrets(case, scenario) for scenario in self.known]
+        known = [s for s in self.scenarios if self.reference("optimum", s) is not None]
+        for case in self.cases if len(known) > 1 else ():
+            strata = [self.regrets(case, scenario) for scenario in known]
             if not all(map(len, strata)):
                 continue
             spread, everything = over_runs(strata), np.concatenate(strata)
@@ -383,16 +362,14 @@ class StudyResults(Shown):
             for name, (head, rows) in tables.items()
         )
 
-    def further(self) -> list[TextTable]:
+    def further(self) -> Iterator[TextTable]:
         """Title, header and rows of the tables that the study asks for beside its summary."""
-        found = []
         against = {name: case.get("against") for name, case in self.cases.items()}
         for scenario, about in (self.about.get("operation") or {}).items():
             judged, seconds = self._judged(scenario), self._seconds(scenario)
-            found += operation.tables(judged, scenario, about, against, seconds)
+            yield from operation.tables(judged, scenario, about, against, seconds)
         if "paper" in self.about["tables"]:
-            found.append(self.paper())
-        return found
+            yield self.paper()
 
     def paper(self) -> TextTable:
         """Title, header and rows: gains of each trained case's median run on every scenario.
@@ -400,26 +377,28 @@ class StudyResults(Shown):
         The paper's two gains imply J(b)/J(a) = (1 − 0.21)/(1 − 0.15) = 0.93.
         """
         rows = []
-        for scenario, case in product(self.scenarios, self.trained):
-            bases = [self.indicator(name, scenario) for name in PAPER]
-            cost = self.indicator(case, scenario)
-            if not all(map(len, (*bases, cost))):
+        trained = [name for name, case in self.cases.items() if case["trained"]]
+        for scenario, case in product(self.scenarios, trained):
+            bases = [self._arrays.get((scenario, name)) for name in PAPER]
+            own = self._arrays.get((scenario, case))
+            known = [base for base in bases if base is not None]
+            if own is None or len(known) < len(bases):
                 continue
-            order = np.argsort(cost.mean(axis=1), kind="stable")
-            middle = order[(len(order) - 1) // 2]
+            cost = own["J"].mean(axis=1)
+            middle = np.argsort(cost, kind="stable")[(len(cost) - 1) // 2]
             gains = [
-                gain(self.indicator(case, scenario, name)[middle], base[0])
+                statistics.gain(own[name][middle], base[name][0])
                 for name in ("J", "economic_cost")
-                for base in (self.indicator(base, scenario, name) for base in PAPER)
+                for base in known
             ]
             agrees = [
                 f"({letter})"
                 for letter, found, wanted in zip("ab", gains[:2], PAPER.values(), strict=True)
                 if abs(100 * found.value - wanted) <= NEAR
             ]
-            ratio = f"{bases[1].mean() / bases[0].mean():.3f}"
-            texts = (shown(one.value, one.interval, 100.0, 3) for one in gains)
-            best = shown(float(cost[middle].mean()), digits=6)
+            ratio = f"{known[1]['J'].mean() / known[0]['J'].mean():.3f}"
+            texts = (shown(*one, 100.0, 3) for one in gains)
+            best = shown(float(cost[middle]), digits=6)
             rows.append([scenario, case, ratio, best, *texts, " and ".join(agrees)])
         said = "the paper's text states about 21 % over (a) and 15 % over (b)"
         header = (
@@ -498,14 +477,14 @@ class StudyResults(Shown):
         marks = marks[np.isfinite(marks)]
         # Naive stays: it is where the curves begin.
         chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
-        level = 100 * regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
+        level = 100 * statistics.regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
         levels = dict(zip(chosen, map(float, level), strict=True))
         return figures.curves_figure(curves, levels, self._looks, relative=known)
 
     def _judged(self, scenario: str) -> operation.Judged:
-        lives = read_table(self.folder / OPERATION, types={"samples": int})
-        lives = lives.reindex(columns=LIVES)  # an older table lacks the latest ones
-        greedy = read_table(self.folder / GREEDY, types={"samples": int})
+        lives = read_table(self.folder / OPERATION, needed=["samples"])
+        lives = lives.reindex(columns=MEASURED[OPERATION])  # an older table lacks the latest ones
+        greedy = read_table(self.folder / GREEDY, MEASURED[GREEDY])
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
         return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
 
@@ -514,13 +493,12 @@ class StudyResults(Shown):
         path = self.folder / TIMING
         if not path.is_file():
             return {}
-        clock = read_table(path, types={"run": str}).set_index("run").training_seconds
+        clock = read_table(path, needed=["run"]).set_index("run").training_seconds
         last = self.about["operation"][scenario]["columns"][-1]
         own = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
         names = own.case + " on " + scenario + ", seed " + own.training_seed.astype(str)
         seconds = (names + f", sample {last}").map(clock)
-        found: dict[str, float] = seconds.groupby(own.case).median().to_dict()
-        return found
+        return dict(seconds.groupby(own.case).median())
 
     def _operation(self, scenario: str) -> Figure | None:
         if scenario not in (self.about.get("operation") or {}):
@@ -544,23 +522,20 @@ class StudyResults(Shown):
     def _page(self, drawn: Mapping[str, list[str]]) -> dict[str, Any]:
         """The report, for its templates.
 
-        A section has a title and may have a note, tables, and names of figures in `figures`.
+        A section has a title and may have a note, a table, and names of figures in `figures`.
         """
         sections: list[dict[str, Any]] = []
-        for scenario in self.scenarios:
-            table = ("", *self.lines(scenario))
-            section = {"title": f"Scenario {scenario}", "note": self._noise(scenario)}
-            sections.append(section | {"tables": [table], "figures": drawn[scenario]})
+        for name in self.scenarios:
+            words = {"title": f"Scenario {name}", "note": self._noise(name)}
+            sections.append(words | {"table": self.lines(name), "figures": drawn[name]})
         if len(self.aggregate):
-            rows = self.aggregate.to_dict("records")
-            table = ("", *report.texts(rows, report.AGGREGATE))
-            sections.append({"title": "All scenarios", "tables": [table]})
-        for title, header, lines in self.further():
-            sections.append({"title": title, "tables": [("", header, lines)]})
+            table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE)
+            sections.append({"title": "All scenarios", "table": table})
+        sections += [{"title": title, "table": table} for title, *table in self.further()]
         if self.about["pictures"]:
             sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
-        table = ("", *report.texts(self.cases.values(), report.CASES))
-        sections.append({"title": "Cases", "tables": [table]})
+        table = report.texts(self.cases.values(), report.CASES)
+        sections.append({"title": "Cases", "table": table})
         made = self.about["made_with"]
         return {
             "title": self.about["title"] or self.name,
@@ -593,58 +568,41 @@ def _columns(name: str, found: Estimate) -> dict[str, float]:
     return {name: found.value, f"{name}_low": low, f"{name}_high": high}
 
 
-def _stacked(parts: Iterable[pd.DataFrame], columns: list[str]) -> pd.DataFrame:
-    """The tables one below the other, with these columns."""
-    parts = [part for part in parts if len(part)]
-    table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-    return table.reindex(columns=columns).astype({"training_seed": "Int64"})
+def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
+    """The tables `MEASURED` of finished runs.
 
-
-def _frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:
-    """State, evaluation and curves of finished runs."""
-    states, evaluations, curves = [], [], []
+    In operation the optimum has a life on the noise of every training seed, of which J is known.
+    """
+    parts: dict[str, list[pd.DataFrame]] = {name: [] for name in MEASURED}
     for store in stores:
         run, about = store.run, store.about
-        key = dict(zip(KEYS, (run.key.scenario, run.key.case, run.key.seed), strict=True))
+        key = dict(zip(KEYS, (run.scenario.name, run.case, run.seed), strict=True))
         counts = {name: int(about.get(name, 0)) for name in ("samples", "plant_samples")}
-        states.append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
-        rows = store.measured(EVALUATION).rename_axis("seed").reset_index()
-        evaluations.append(rows.assign(**key, steps=run.noise[EVALUATION].steps))
+        parts[RUNS].append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
         if run.training is not None:
-            curves.append(read_table(store.folder / LOG).assign(**key))
-        elif GREEDY in run.noise:
-            greedy_J = float(store.measured(GREEDY).J.mean())
-            curves.append(pd.DataFrame([key | {"greedy_J": greedy_J}]))
-    curve = _stacked(curves, [*KEYS, *CURVE])
-    return [
-        _stacked(states, STATE),
-        _stacked(evaluations, [*KEYS, "seed", "steps", *INDICATORS]),
-        curve.astype({"samples": "Int64"} | dict.fromkeys(CURVE[1:], float)),
-    ]
-
-
-def _lives(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows of the lives, by run and mark, and of the greedy evaluations, by noise seed, too.
-
-    The optimum has a life on the noise of every training seed, of which J is known.
-    """
-    alive, greedy = [], []
-    for store in stores:
-        run, key = store.run, store.run.key
-        names, online = {"scenario": key.scenario, "case": key.case}, []
+            log = read_table(store.folder / LOG).assign(**key)
+            parts[CURVES].append(log)
+            parts[OPERATION] += [log] if run.marks else []
+        online = []
         for file, noise in run.noise.items():
+            if noise.whole:
+                continue
+            rows = store.measured(file).rename_axis("seed").reset_index()
             if noise.mark:
-                rows = store.measured(file).rename_axis("seed").reset_index()
-                greedy.append(rows.assign(**names, training_seed=key.seed, samples=noise.mark))
-            elif file.startswith("online-"):
-                rows = store.measured(file)[["J"]].rename_axis("training_seed").reset_index()
-                online.append(rows.assign(**names, samples=noise.steps))
-        if run.marks and run.training is not None:
-            rows = read_table(store.folder / LOG, types={"samples": int})
-            alive.append(rows.assign(**names, training_seed=key.seed))
-        elif online:
-            alive.append(pd.concat(online).sort_values(["training_seed", "samples"]))
-    return _stacked(alive, LIVES), _stacked(greedy, [*KEYS, "samples", "seed", "J"])
+                parts[GREEDY].append(rows.assign(**key, samples=noise.mark))
+            elif file == GREEDY:
+                mean = key | {"greedy_J": float(rows.J.mean())}
+                parts[CURVES].append(pd.DataFrame([mean]))
+            elif file == EVALUATION:
+                parts[EVALUATION].append(rows.assign(**key, steps=noise.steps))
+            else:
+                life = key | {"training_seed": rows.seed, "samples": noise.steps}
+                online.append(rows[["J"]].assign(**life))
+        if online:
+            parts[OPERATION].append(pd.concat(online).sort_values(["training_seed", "samples"]))
+    none = [pd.DataFrame()]
+    found = {name: pd.concat(own or none, ignore_index=True) for name, own in parts.items()}
+    return {name: typed(found[name].reindex(columns=columns)) for name, columns in MEASURED.items()}
 
 
 def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
@@ -652,9 +610,9 @@ def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
     rows = []
     for store in stores:
         clock = store.about.get("timing", {})
-        seconds = {str(store.run.key): clock.get("wall_seconds", 0.0)}
+        seconds = {str(store.run): clock.get("wall_seconds", 0.0)}
         marks = clock.get("processor_seconds", {})
-        seconds |= {f"{store.run.key}, sample {mark}": value for mark, value in marks.items()}
+        seconds |= {f"{store.run}, sample {mark}": value for mark, value in marks.items()}
         rows += [{"run": name, "training_seconds": float(value)} for name, value in seconds.items()]
     return pd.DataFrame(rows, columns=["run", "training_seconds"])
 
@@ -673,8 +631,6 @@ def document(plan: Plan) -> dict[str, Any]:
         "cases": [
             {
                 **{name: getattr(case, name) for name in SAME},
-                "start": definition.relative(case.start),
-                "target": definition.relative(case.target),
                 "trained": case.algorithm is not None,
                 "against": definition.counterpart(case),
             }
@@ -686,7 +642,6 @@ def document(plan: Plan) -> dict[str, Any]:
         "curves": {name: [len(noise.seeds), noise.steps] for name, noise in curves.items()},
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
-        "pictures": [],
         "made_with": dict(plan.provenance) | {"commit": report.commit()},
     }
     trains = any(case.algorithm for case in definition.cases)
@@ -701,8 +656,7 @@ def document(plan: Plan) -> dict[str, Any]:
             }
             for name, scenario in definition.scenarios.items()
         }
-    found: dict[str, Any] = json.loads(json.dumps(about))
-    return found
+    return dict(json.loads(json.dumps(about)))
 
 
 @known_keywords

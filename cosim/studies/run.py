@@ -41,7 +41,7 @@ from cosim.errors import EvaluationError, StudyError
 from cosim.files import read_json, temporary_folder, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plant.fmi import unpack
-from cosim.plugins import OURS, build_controller, changed, code_hash, import_from
+from cosim.plugins import build_controller, changed, code_hash, import_from
 from cosim.processes import Terminated, follow_parent, without_interrupts
 from cosim.protocols import Controller, Vector
 from cosim.scenario import Scenario
@@ -66,8 +66,11 @@ INDICATORS = (
 )  # fmt: skip
 KEY = ["seed", "steps", "burn_in"]
 TYPES: dict[str, Any] = {
-    "scenario": str, "case": str, "training_seed": "Int64", "status": str, "seed": "uint64",
-}  # fmt: skip
+    **dict.fromkeys(("scenario", "case", "status", "run"), str),
+    **dict.fromkeys(("training_seed", "samples", "plant_samples"), "Int64"),
+    **dict.fromkeys(("steps", "burn_in"), int),
+    "seed": "uint64",
+}
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 PAUSE = 20
 """Least time between two writes of the tables, in multiples of the time that one takes."""
@@ -82,24 +85,25 @@ ROUNDS = 3
 Figures = dict[str, Any]
 Measured = dict[int, tuple[Figures, Figures]]
 """Indicators and times by noise seed."""
+Trained = tuple[str, str, Figures]
+"""learning.csv and θ at the end of a training, as texts, and what run.json says of it: `status`
+(`finished` or `diverged: …`), `samples`, `plant_samples`, and `timing` in s."""
 
 
-def read_table(
-    path: Path, columns: Sequence[str] = (), types: Mapping[str, Any] | None = None
-) -> pd.DataFrame:
-    """Columns of a CSV (default: all), typed by `types` and `TYPES`.
-
-    Raises StudyError.
-    """
+def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = ()) -> pd.DataFrame:
+    """Columns of a CSV (default: all, the `needed` among them), `typed`; raises StudyError."""
     import pandas as pd  # noqa: PLC0415
 
-    kinds = TYPES | dict(types or {})
     try:
         texts = pd.read_csv(path, dtype="string", keep_default_na=False, na_values=[""])
-        names = dict.fromkeys([*(columns or texts), *(types or ())])
-        return texts[[*names]].astype({name: kinds.get(name, float) for name in names})
+        return typed(texts[list(dict.fromkeys([*(columns or texts), *needed]))])
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise StudyError(f"'{path}' is missing or damaged: {error}") from None
+
+
+def typed(frame: pd.DataFrame) -> pd.DataFrame:
+    """A frame with the types of `TYPES`."""
+    return frame.astype({name: TYPES.get(name, float) for name in frame})
 
 
 def to_csv(frame: pd.DataFrame) -> str:
@@ -108,32 +112,6 @@ def to_csv(frame: pd.DataFrame) -> str:
 
 
 # What a run is
-
-
-@dataclass(frozen=True)
-class TrainingTask:
-    """Arguments of `learning`'s `prepare`: equal ones give equal θ on any worker."""
-
-    algorithm: str
-    scenario: Scenario
-    samples: int
-    settings: Mapping[str, Any]
-    options: Mapping[str, Any]
-
-    def prepare(self) -> TrainingRun:
-        """The training run, checked; raises LearningError in one line."""
-        from learning.training import prepare  # noqa: PLC0415
-
-        return prepare(self.algorithm, self.scenario, self.samples, self.settings, self.options)
-
-    def controller(self, parameters: str) -> RtiNmpc:
-        """The greedy controller of the θ that a TOML text holds."""
-        problem = Problem.from_scenario(self.scenario)
-        with temporary_folder("cosim-theta-") as folder:
-            path = folder / "parameters.toml"
-            path.write_text(parameters, "utf-8")
-            found = Parameters.load(path, problem)
-        return nmpc(self.scenario, found, self.options["controller"])
 
 
 class Noise(NamedTuple):
@@ -164,18 +142,30 @@ def safe(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class RunKey:
-    """A run: scenario, case, and training seed (None for a controller).
+class Run:
+    """One run of a case on a scenario: a controller, or a training with a `seed`, and its θ.
+
+    `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
+    training. `training` holds the other arguments of `learning`'s `prepare`: equal ones give equal
+    θ on any worker. `facts` are all that its results depend on, `noise` that of its evaluations, by
+    the file of the results; `kept` where the study keeps a copy of a file, relative to its folder;
+    `marks` the samples of operation at which θ, or the optimum, is judged.
 
     Raises StudyError where a name is made of dots, or has a separator of folders.
     """
 
-    scenario: str
+    scenario: Scenario
     case: str
+    facts: Mapping[str, Any]
+    noise: Mapping[str, Noise]
+    controller: Any = None
     seed: int | None = None
+    training: Mapping[str, Any] | None = None
+    kept: Mapping[str, str] = field(default_factory=dict)
+    marks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in (self.scenario, self.case):
+        for name in (self.scenario.name, self.case):
             if not name.strip(". ") or "/" in name or "\\" in name:
                 raise StudyError(
                     f"'{name}' cannot name a scenario, case or controller: it would name a folder "
@@ -185,53 +175,40 @@ class RunKey:
     @property
     def folder(self) -> Path:
         """Where its files are, relative to the study's folder."""
-        parts = [safe(self.scenario), safe(self.case)]
+        parts = [safe(self.scenario.name), safe(self.case)]
         return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
 
     def __str__(self) -> str:
         seed = "" if self.seed is None else f", seed {self.seed}"
-        return f"{self.case} on {self.scenario}{seed}"
+        return f"{self.case} on {self.scenario.name}{seed}"
 
+    def prepared(self) -> TrainingRun:
+        """The training, checked; raises LearningError in one line."""
+        from learning.training import prepare  # noqa: PLC0415
 
-@dataclass(frozen=True)
-class Run:
-    """One run: a controller, or a training and its θ.
+        return prepare(scenario=self.scenario, **(self.training or {}))
 
-    `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `facts` are all that its results depend on, `noise` that of its evaluations, by the
-    file of the results; `kept` where the study keeps a copy of a file, relative to its folder;
-    `marks` the samples of operation at which θ, or the optimum, is judged.
-    """
-
-    key: RunKey
-    scenario: Scenario
-    controller: Any
-    training: TrainingTask | None
-    facts: Mapping[str, Any]
-    noise: Mapping[str, Noise]
-    kept: Mapping[str, str] = field(default_factory=dict)
-    marks: tuple[int, ...] = ()
+    def policy(self, parameters: str = "") -> Any:
+        """The controller; of a training the greedy one of the θ that a TOML text holds."""
+        if self.training is None:
+            if isinstance(self.controller, str):
+                return build_controller(self.controller, self.scenario)
+            return self.controller(self.scenario)
+        problem = Problem.from_scenario(self.scenario)
+        with temporary_folder("cosim-theta-") as folder:
+            path = folder / "parameters.toml"
+            path.write_text(parameters, "utf-8")
+            found = Parameters.load(path, problem)
+        return nmpc(self.scenario, found, self.training["options"]["controller"])
 
     @property
     def samples(self) -> int:
         """Plant samples of the run; those of greedy evaluations while training apart."""
-        trained = 0 if self.training is None else self.training.samples
-        return trained + sum(noise.samples for noise in self.noise.values())
+        trained = 0 if self.training is None else self.training["samples"]
+        return int(trained) + sum(noise.samples for noise in self.noise.values())
 
 
 # A worker's part of a run
-
-
-class Trained(NamedTuple):
-    """A training at its end: learning.csv and θ as texts, and what run.json says of it.
-
-    That is its `status`, `finished` or `diverged: …`, its `samples`, `plant_samples`, all that the
-    plant gave for it, and `timing`: seconds, of operation also the processor's up to each mark.
-    """
-
-    log: str
-    parameters: str
-    about: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -271,17 +248,10 @@ class Item:
 
 @dataclass(frozen=True)
 class Failure:
-    """A failed item: message, traceback, and the class of our own errors."""
+    """A failed item: message and traceback."""
 
     message: str
     traceback: str
-    kind: type[Exception] | None = None
-
-    def error(self) -> Exception:
-        """The error once more; an EvaluationError for that of a plug-in."""
-        if self.kind is not None and self.kind.__init__ is Exception.__init__:
-            return self.kind(self.message.partition(": ")[2])
-        return EvaluationError(self.message)
 
 
 Outcome = Trained | Measured | str | Failure
@@ -296,19 +266,14 @@ def perform(item: Item) -> tuple[Item, Outcome]:
         raise
     except BaseException as error:
         text = " ".join(f"{error}".split()) or type(error).__name__
-        message = f"{type(error).__name__}: {text}"
-        kind = type(error) if isinstance(error, Exception) else None
-        if kind is not None and kind.__module__.partition(".")[0] not in OURS:
-            kind = None
-        return item, Failure(message, traceback.format_exc(), kind)
+        return item, Failure(f"{type(error).__name__}: {text}", traceback.format_exc())
 
 
 def _train(run_: Run, folder: Path | None) -> Trained:
     from cosim.studies import operation  # noqa: PLC0415
     from learning.training import COLUMNS, LogRow, run_training, to_csv  # noqa: PLC0415
 
-    assert run_.training is not None
-    run, marks, begin = run_.training.prepare(), run_.marks, time.perf_counter()
+    run, marks, begin = run_.prepared(), run_.marks, time.perf_counter()
     clock: Mapping[int, float] = {}
     if marks:
         rows, status, clock, taken = operation.live(run, marks)
@@ -324,25 +289,21 @@ def _train(run_: Run, folder: Path | None) -> Trained:
         rows = [LogRow(start | {"samples": 0.0}, result.start), *result.rows]
     seconds = {"wall_seconds": time.perf_counter() - begin, "processor_seconds": clock}
     about = {"status": status, "samples": samples, "plant_samples": taken, "timing": seconds}
-    return Trained(to_csv(rows), theta.to_toml(), about)
+    return to_csv(rows), theta.to_toml(), about
 
 
 def _simulate(item: Item) -> Measured | str:
     run, (seeds, steps, burn_in, whole, mark) = item.run, item.noise
-    scenario, factory = run.scenario, run.controller
+    scenario = run.scenario
     if mark:
         from cosim.studies.operation import optimum_at, plant_at  # noqa: PLC0415
 
         scenario = plant_at(scenario, mark * scenario.sampling_time)
     controller: Controller
     if run.training is not None:
-        controller = _judging(run.training, item)
-    elif mark:
-        controller = optimum_at(run.scenario, mark)
-    elif isinstance(factory, str):
-        controller = build_controller(factory, scenario)
+        controller = _judging(item)
     else:
-        controller = factory(scenario)
+        controller = optimum_at(run.scenario, mark) if mark else run.policy()
     compile_functions(controller, sum(noise.samples for noise in run.noise.values()))
     with FmuPlant(scenario) as plant:
         if whole:
@@ -354,11 +315,11 @@ _judged: dict[str, tuple[RtiNmpc, Vector]] = {}
 """The run that was judged last here: its controller and final θ."""
 
 
-def _judging(training: TrainingTask, item: Item) -> RtiNmpc:
+def _judging(item: Item) -> RtiNmpc:
     """The controller with an item's θ; to build one takes as long as 8000 of its samples."""
-    key = f"{item.run.key} {item.run.facts} {item.run.noise} {item.parameters}"
+    key = f"{item.run} {item.run.facts} {item.run.noise} {item.parameters}"
     if key not in _judged:
-        controller = training.controller(item.parameters)
+        controller = item.run.policy(item.parameters)
         _judged.clear()
         _judged[key] = controller, controller.theta
     controller, final = _judged[key]
@@ -385,7 +346,7 @@ class RunStore:
     """
 
     def __init__(self, out: Path, run: Run) -> None:
-        self.folder = out / run.key.folder
+        self.folder = out / run.folder
         self.remarks: list[str] = []
         """What was changed or damaged and is done anew, in words."""
         self.run = run
@@ -463,9 +424,9 @@ class RunStore:
             return self._known[file]
         found = self._known[file] = {}
         if path.is_file():
-            wanted = () if file == TIMING else (*KEY, *INDICATORS)
+            wanted = () if file == TIMING else INDICATORS
             try:
-                rows = read_table(path, wanted, dict.fromkeys(KEY[1:], int)).set_index("seed")
+                rows = read_table(path, wanted, KEY).set_index("seed")
             except StudyError:
                 self.remarks.append(f"'{path}' is damaged; made anew")
                 return found
@@ -500,7 +461,7 @@ class RunStore:
                 yield replace(base, folder=self.folder.absolute() if shared_disk else None)
                 return
             base = replace(base, parameters=(self.folder / PARAMETERS).read_text("utf-8"))
-            self.done = training.samples
+            self.done = training["samples"]
         for file, noise in self.run.noise.items():
             missing = noise._replace(seeds=self.missing(file))
             self.done += noise.samples - missing.samples
@@ -520,12 +481,12 @@ class RunStore:
         self.done += item.noise.samples
         if isinstance(outcome, str):
             write_atomically(self.folder / item.file, outcome)
-        elif isinstance(outcome, Trained):
-            self.done = outcome.about["samples"]
-            write_atomically(self.folder / LOG, outcome.log)
-            write_atomically(self.folder / PARAMETERS, outcome.parameters)
-            files = {name: _digest(self.folder / name) for name in TRAINED}
-            self._note(**outcome.about, files=files)
+        elif isinstance(outcome, tuple):
+            *texts, about = outcome
+            for name, text in zip(TRAINED, texts, strict=True):
+                write_atomically(self.folder / name, text)
+            self.done = about["samples"]
+            self._note(**about, files={name: _digest(self.folder / name) for name in TRAINED})
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
         else:
             parts = [(item.file, 0), *([(TIMING, 1)] if item.file == EVALUATION else [])]
@@ -583,14 +544,12 @@ class Runner:
 
     def __init__(self, runs: list[Run], out: Path, folders: tuple[Path, ...], report: Report):
         self._report, self._folders = report, tuple(map(str, dict.fromkeys(folders)))
-        taken: dict[str, RunKey] = {}
+        taken: dict[str, Run] = {}
         for run in runs:  # upper and lower case are equal on some systems
-            other = taken.setdefault(str(run.key.folder).lower(), run.key)
-            if other is not run.key:
-                raise StudyError(
-                    f"'{run.key}' and '{other}' would have one folder; rename one of them"
-                )
-        self.stores = {str(run.key): RunStore(out, run) for run in runs}
+            other = taken.setdefault(str(run.folder).lower(), run)
+            if other is not run:
+                raise StudyError(f"'{run}' and '{other}' would have one folder; rename one of them")
+        self.stores = {str(run): RunStore(out, run) for run in runs}
         self.failures: dict[str, Failure] = {}
         """The first failure of each run that failed."""
         self.remarks = list(dict.fromkeys(x for s in self.stores.values() for x in s.remarks))
@@ -632,7 +591,7 @@ class Runner:
 
     def _take(self, item: Item, outcome: Outcome) -> None:
         """Store and report the outcome of an item."""
-        name = str(item.run.key)
+        name = str(item.run)
         store, line = self.stores[name], ""
         if isinstance(outcome, Failure):
             if name in self.failures:
@@ -642,7 +601,7 @@ class Runner:
             self._tell(f"failed: {name}: {outcome.message}")
             return
         store.take(item, outcome)
-        if isinstance(outcome, Trained):
+        if isinstance(outcome, tuple):
             line = "" if store.status == "finished" else f"{name}: {store.status}"
         else:
             store.seal()

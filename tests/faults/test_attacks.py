@@ -16,7 +16,7 @@ from cosim.comparison import compare, load_run
 from cosim.errors import CosimError, StudyError
 from cosim.files import check_target, protect, write_atomically
 from cosim.recording import RerunRecorder
-from cosim.studies.run import RunKey
+from cosim.studies.run import Run
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Proportional
 
@@ -144,7 +144,7 @@ NAMES = [".", "..", " ", "", "/etc", "../a", "a/", "a\\b", "C:\\a"]
 def test_a_name_that_leads_elsewhere_is_refused_for_scenarios_and_cases(name):
     for scenario, case in ((name, "q"), ("paper", name)):
         with pytest.raises(StudyError):
-            RunKey(scenario, case)
+            Run(SimpleNamespace(name=scenario), case, {}, {})
 
 
 # Files ------------------------------------------------------------------------------------------

@@ -246,10 +246,14 @@ def test_lists_are_a_grid_and_name_what_varies():
 
 
 def test_files_are_seen_from_the_study():
-    assert cases(start="mine.toml")[0].start == str(Path("/study/mine.toml"))
+    study = Study.from_dict(document(), "/study")
+    assert [study.located(name) for name in ("mine.toml", "naive")] == [
+        str(Path("/study/mine.toml")),
+        "naive",
+    ]
     found = cases(name=None, algorithm=None, controller=["theta/mine.toml", "module:make"])
     assert [(one.name, one.training_seeds) for one in found] == [("mine", ()), ("module.make", ())]
-    assert found[0].controller == str(Path("/study/theta/mine.toml"))
+    assert found[0].controller == "theta/mine.toml"
 
 
 def test_a_counterpart_is_that_of_the_same_point_of_the_grid():
@@ -267,14 +271,14 @@ def moved(folder, start="clean"):
     shutil.copy(ROOT / "results" / "starts" / f"{start}.toml", folder / "start.toml")
     runs = [{"controller": "start.toml"}, case("q", start="start.toml")]
     found = plan(Study.from_dict(document(case=runs), folder))
-    return {run.key: run.facts for run in found.runs}
+    return {run.case: run.facts for run in found.runs}
 
 
 def test_a_study_that_moved_keeps_its_runs_and_another_theta_at_the_start_is_another_run(tmp_path):
     here = moved(tmp_path / "here")
     assert here == moved(tmp_path / "there")
     changed = moved(tmp_path / "other", "fouled")
-    assert {key.case for key in here if here[key] != changed[key]} == {"start", "q"}
+    assert {key for key in here if here[key] != changed[key]} == {"start", "q"}
 
 
 def test_results_of_a_folder_are_those_that_were_returned(whole):

@@ -57,8 +57,8 @@ def evaluate(
 
     On a seed all controllers meet the same disturbances (common random numbers). A stored optimum
     runs too, for J*, without rows of its own unless it is named. Raises EvaluationError on a
-    malformed request, a failed run or failed workers, StudyError on a name that no folder can have,
-    and what building a controller raises.
+    malformed request or failed workers, StudyError on a name that no folder can have, and what
+    building or running a controller raises.
 
     Args:
         controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
@@ -110,7 +110,7 @@ def evaluate(
             tell(0, "", line)
         runner.run(jobs, scheduler)
         for failure in runner.failures.values():
-            raise EvaluationError(failure.message)
+            raise failure.error()
         stores = dict(zip(named, runner.stores.values(), strict=True))
         columns, timing = (
             {name: store.measured(file) for name, store in stores.items()}

@@ -41,7 +41,7 @@ from cosim.errors import EvaluationError, StudyError
 from cosim.files import read_json, temporary_folder, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plant.fmi import unpack
-from cosim.plugins import build_controller, changed, code_hash, import_from
+from cosim.plugins import OURS, build_controller, changed, code_hash, import_from
 from cosim.processes import Terminated, follow_parent, without_interrupts
 from cosim.protocols import Controller, Vector
 from cosim.scenario import Scenario
@@ -248,10 +248,17 @@ class Item:
 
 @dataclass(frozen=True)
 class Failure:
-    """A failed item: message and traceback."""
+    """A failed item: message, traceback, and the class of our own errors."""
 
     message: str
     traceback: str
+    kind: type[Exception] | None = None
+
+    def error(self) -> Exception:
+        """The error once more; an EvaluationError for that of a plug-in."""
+        if self.kind is not None and self.kind.__init__ is Exception.__init__:
+            return self.kind(self.message.partition(": ")[2])
+        return EvaluationError(self.message)
 
 
 Outcome = Trained | Measured | str | Failure
@@ -266,7 +273,11 @@ def perform(item: Item) -> tuple[Item, Outcome]:
         raise
     except BaseException as error:
         text = " ".join(f"{error}".split()) or type(error).__name__
-        return item, Failure(f"{type(error).__name__}: {text}", traceback.format_exc())
+        message = f"{type(error).__name__}: {text}"
+        kind = type(error) if isinstance(error, Exception) else None
+        if kind is not None and kind.__module__.partition(".")[0] not in OURS:
+            kind = None
+        return item, Failure(message, traceback.format_exc(), kind)
 
 
 def _train(run_: Run, folder: Path | None) -> Trained:

@@ -144,19 +144,21 @@ def differences(
 
 
 def _read(path: Path, keys: list[str]) -> pd.DataFrame:
-    """A stored CSV by its key columns, signals by name without unit."""
+    """A stored CSV by its key columns; `attrs` are the units of its signals."""
     try:
         frame = pd.read_csv(path, dtype=str, na_filter=False)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise ResultsError(f"the stored table '{path}' cannot be read: {error}") from None
+    parts = {title: title.removesuffix("]").partition(" [") for title in frame}
+    frame = frame.rename(columns={title: name for title, (name, _, _) in parts.items()})
     try:
-        frame = frame.rename(columns=lambda title: title.partition(" [")[0])
         frame = frame.map(_rounded).set_index(keys).drop(columns=UNCOMPARED, errors="ignore")
         frame = frame.replace("", "nan").astype(float)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the stored table '{path}' is damaged: {error}") from None
     if not frame.index.is_unique:
         raise ResultsError(f"'{path}' has two rows {frame.index[frame.index.duplicated()][0]}")
+    frame.attrs = {name: unit for name, _, unit in parts.values()}
     return frame
 
 
@@ -175,7 +177,7 @@ def _table_differences(
             lost.append(f"{name}: signal {', '.join(lone)} is {columns}")
     common = stored.index.intersection(now.index, sort=False)
     signals = [signal for signal in stored if signal in now]
-    allowed = [_tolerance(signal, tolerances) for signal in signals]
+    allowed = [_tolerance(s, (now.attrs | stored.attrs)[s], tolerances) for s in signals]
     was, value = (table.loc[common, signals].to_numpy() for table in (stored, now))
     same = np.isclose(value, was, 0.0, [one.absolute for one in allowed], equal_nan=True)
     first = {i: k for k, i in reversed(np.argwhere(~same).tolist())}
@@ -186,12 +188,18 @@ def _table_differences(
     return lines + lost
 
 
-def _tolerance(signal: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
+def _tolerance(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
     """The signal's own tolerance, else the first matching pattern's (`theta *`)."""
-    fitting = (one for name, one in tolerances.items() if fnmatchcase(signal, name))
-    if found := tolerances.get(signal) or next(fitting, None):
-        return found
-    raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
+    fitting = (name for name in tolerances if fnmatchcase(signal, name))
+    name = signal if signal in tolerances else next(fitting, None)
+    if name is None:
+        raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
+    if unit and unit != tolerances[name].unit:
+        raise ResultsError(
+            f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in "
+            f"'{tolerances[name].unit}'"
+        )
+    return tolerances[name]
 
 
 def _row(table: pd.DataFrame, row: object) -> str:

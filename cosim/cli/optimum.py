@@ -52,8 +52,9 @@ def optimum(
 
 
 def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Output) -> None:
-    names = [name for name, value in policy.law.plants[0].items() if value is not None]
-    table = [{name: plant[name] for name in names} | {"J": gain} for plant, gain in policy.gains]
+    names = list(policy.law.parameters)
+    values = zip(*policy.law.parameters.values(), policy.gains, strict=True)
+    table = [dict(zip((*names, "J"), row, strict=True)) for row in values]
     rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
     rows.append(("mean", *[""] * (len(names) - 1), f"{policy.gain:.4f}"))
     title = f"quasi-static reference of {task.name}: a reference, not a bound"

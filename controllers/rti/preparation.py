@@ -260,7 +260,7 @@ def embedding(
         "embedding",
         {"s": s, "theta": symbols.theta, **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
-        {name: prepared.memory[prepared.places[name]] for name in prior}
+        {name: prepared.part(name).reshape(-1) for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
@@ -339,7 +339,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
         {
-            name: prepared.memory[prepared.places[name]]
+            name: prepared.part(name).reshape(-1)
             for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
         },
         room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
@@ -507,13 +507,9 @@ class SampleFunctions:
 
     def qp(self, before: Vector, after: Vector) -> SoftQp:
         """The QP in the memory of preparation and read-out, `before` and `after`, or copies."""
-        prepared, read = self.preparation.places, self.readout.places
+        vectors = ("f", "lower", "upper", "row_lower", "row_upper")
         return SoftQp(
-            H=self.preparation.part("H", before),
             rows=self.preparation.part("Gamma", before),
-            **{name: before[prepared[name]] for name in ("w", "W")},
-            **{
-                name: after[read[name]]
-                for name in ("f", "lower", "upper", "row_lower", "row_upper")
-            },
+            **{name: self.preparation.part(name, before) for name in ("H", "w", "W")},
+            **{name: self.readout.part(name, after) for name in vectors},
         )

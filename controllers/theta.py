@@ -348,36 +348,26 @@ class Parameters(Shown):
         return parameters
 
 
-@dataclass(frozen=True)
-class SymbolicTheta:
-    """θ as one symbol; `symbols["B_l"]` is a whole block, or the problem's constant without one.
+Symbols = dict[str, ca.SX]
 
-    `theta` (n_θ,) is the symbol, `unpacked` holds the blocks by name, and `model_parameters` (n_p,)
-    are the model's, with θ's own in their places.
+
+def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
+    """Symbol `theta` (n_θ,), its blocks by name, and `model_parameters` (n_p,) with θ's own in it.
+
+    A slack weight that is no block is the problem's constant.
     """
-
-    theta: ca.SX
-    unpacked: dict[str, ca.SX]
-    model_parameters: ca.SX
-
-    def __getitem__(self, name: str) -> ca.SX:
-        return self.unpacked[name]
-
-    @classmethod
-    def of(cls, problem: Problem, blocks: ThetaBlocks) -> SymbolicTheta:
-        """Symbols for these blocks of θ."""
-        theta = ca.SX.sym("theta", blocks.size)
-        unpacked = {}
-        for block in blocks:
-            part = theta[blocks.slices[block.name]]
-            if block.symmetric:
-                place = block.unpack(np.arange(float(block.size))).astype(int)
-                part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
-            unpacked[block.name] = part
-        unpacked.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
-        unpacked.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
-        parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
-        if "p" in blocks:
-            for i, index in enumerate(problem.model.parameter_indices(blocks.block("p").labels)):
-                parameters[index] = unpacked["p"][i]
-        return cls(theta, unpacked, parameters)
+    theta = ca.SX.sym("theta", blocks.size)
+    symbols = {"theta": theta}
+    for block in blocks:
+        part = theta[blocks.slices[block.name]]
+        if block.symmetric:
+            place = block.unpack(np.arange(float(block.size))).astype(int)
+            part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
+        symbols[block.name] = part
+    symbols.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
+    symbols.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
+    parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
+    if "p" in blocks:
+        for i, index in enumerate(problem.model.parameter_indices(blocks.block("p").labels)):
+            parameters[index] = symbols["p"][i]
+    return symbols | {"model_parameters": parameters}

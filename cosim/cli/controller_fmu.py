@@ -19,7 +19,7 @@ from cosim.plant.fmu_plant import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
-from fmus.build import build_sampled, sampled_system
+from fmus.build import build_model, sampled_system
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
 from fmus.ssp import write_ssp
 
@@ -153,7 +153,7 @@ def write_fmu(
         "theta_hash": controller.parameters.hash,
     }
     document = (json.dumps(record, indent=2, default=repr) + "\n").encode()
-    return build_sampled(
+    return build_model(
         system, target, version, every_platform=every_platform, files={RECORD: document}
     )
 

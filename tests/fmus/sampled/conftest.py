@@ -7,7 +7,7 @@ import fmpy
 import pytest
 
 from fmus import BuildError
-from fmus.build import build_sampled, sampled_system
+from fmus.build import build_model, sampled_system
 from fmus.model import FmuModel, Kind, Variable
 from tests.helpers.instance import Instance
 
@@ -54,7 +54,7 @@ def adder() -> FmuModel:
 def built(request, adder: FmuModel, tmp_path_factory) -> tuple[int, Path]:
     folder = tmp_path_factory.mktemp("sampled")
     try:
-        return request.param, build_sampled(adder, folder / "adder.fmu", request.param)
+        return request.param, build_model(adder, folder / "adder.fmu", request.param)
     except BuildError as error:
         pytest.skip(str(error))
 

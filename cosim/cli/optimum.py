@@ -127,6 +127,8 @@ def tuning(
     cost's Hessian, and the local feedback gain of both.
     """
     with cli.output(json) as out_:
+        import numpy as np
+
         from controllers.economic import tune
         from controllers.factories import value_offset
         from controllers.problem import Problem
@@ -146,8 +148,8 @@ def tuning(
             "scenario": scenario,
             "steady_state": {"states": states, "actions": actions, "cost": steady.cost},
             "active": dict(zip(steady.active, prices, strict=True)),
-            "economic_eigenvalues": steady.eigenvalues.tolist(),
-            "convexified_eigenvalues": convex.eigenvalues.tolist(),
+            "economic_eigenvalues": np.linalg.eigvalsh(steady.hessian).tolist(),
+            "convexified_eigenvalues": np.linalg.eigvalsh(convex.hessian).tolist(),
             "gain_error": result.gain_error,
             "parameters": result.parameters.hash,
         }

@@ -75,10 +75,7 @@ class Variable:
 
 def read_variables(file: Path) -> list[Variable]:
     """The table of variables in a CSV file with a column for each field of `Variable`."""
-
-    def number(text: str) -> float | None:
-        return float(text) if text else None
-
+    numbers = ("start", "min", "max", "nominal")
     with file.open(encoding="utf-8", newline="") as lines:
         return [
             Variable(
@@ -86,12 +83,9 @@ def read_variables(file: Path) -> list[Variable]:
                 Kind[row["kind"]],
                 Type[row["type"]],
                 row["unit"],
-                number(row["start"]),
-                number(row["min"]),
-                number(row["max"]),
-                number(row["nominal"]),
-                row["description"],
-                tuple(row["uses"].split()),
+                **{key: float(row[key]) if row[key] else None for key in numbers},
+                description=row["description"],
+                uses=tuple(row["uses"].split()),
             )
             for row in csv.DictReader(lines)
         ]

@@ -44,29 +44,19 @@ class LinearisationPoint(NamedTuple):
 
 
 class Functions(SampleFunctions):
-    """The CasADi functions of a controller: a sample's, and its derivatives in θ.
-
-    Those are `controllers.sensitivities`, made when they are first asked for.
-    """
+    """The CasADi functions of a controller: a sample's, and its derivatives in θ."""
 
     @cached_property
-    def _derivatives(self) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
+    def derivatives(self) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
+        """The value's gradient and a maker of the policy's derivatives, on first use."""
         exact = isinstance(self.hessian, Exact)
         return sensitivities(self.problem, self.blocks, exact=exact)
 
     @property
-    def gradient(self) -> StackedFunction:
-        """The gradient of the value."""
-        return self._derivatives[0]
-
-    def policy(self) -> StackedFunction:
-        """The derivatives of the policy."""
-        return self._derivatives[1]()
-
-    @property
     def named(self) -> dict[str, StackedFunction]:
         """The functions by the prefix of their constants in C."""
-        return super().named | {"GRADIENT": self.gradient, "POLICY": self.policy()}
+        gradient, make_policy = self.derivatives
+        return super().named | {"GRADIENT": gradient, "POLICY": make_policy()}
 
     def condense(self, before: Vector, after: Vector) -> None:
         """Write the condensed QP into copies of both memories."""
@@ -213,7 +203,7 @@ class RtiSolution:
         """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
         if self.prepared.engine is not None:
             return self._part("gradient")
-        function = self.prepared.functions.gradient
+        function, _ = self.prepared.functions.derivatives
         self._write_solution(function)
         function()
         return function.stack.copy()
@@ -241,7 +231,7 @@ class RtiSolution:
             if found is not None:
                 return found
         dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
-        function = prepared.functions.policy()
+        function = prepared.functions.derivatives[1]()
         self._write_solution(function)
         inputs = function.inputs
         for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):

@@ -101,23 +101,20 @@ class Grid:
 
     def weights(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
         """Grid indices and weights of interpolation at states given as one array per entry."""
-        positions, factors = [], []
-        strides = np.cumprod((1, *self.shape[:0:-1]))[::-1]
-        for interpolant, stride, values in zip(self._interpolants, strides, x, strict=True):
+        corners: list[tuple[Indices, Array]] = [(np.zeros((), dtype=np.intp), np.ones(()))]
+        for interpolant, axis, values in zip(self._interpolants, self.axes, x, strict=True):
             cell, offset = interpolant.locate(values)
-            start = interpolant.first[cell]
-            points = interpolant.weights.shape[1]
-            positions.append([stride * (start + j) for j in range(points)])
-            factors.append(
-                [_horner(interpolant.weights[:, j], cell, [offset]) for j in range(points)]
-            )
-        result = []
-        for stencil in itertools.product(*(range(len(row)) for row in positions)):
-            index, weight = np.zeros((), dtype=np.intp), np.ones(())
-            for position, factor, j in zip(positions, factors, stencil, strict=True):
-                index, weight = index + position[j], weight * factor[j]
-            result.append((index, weight))
-        return result
+            first = interpolant.first[cell]
+            own = [
+                (first + j, _horner(interpolant.weights[:, j], cell, [offset]))
+                for j in range(interpolant.weights.shape[1])
+            ]
+            corners = [
+                (index * len(axis) + position, weight * factor)
+                for index, weight in corners
+                for position, factor in own
+            ]
+        return corners
 
     def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
         """Function that interpolates `values` (G,) at states given as one array per entry."""

@@ -101,13 +101,13 @@ class Unit:
     name: str
     factor: float = 1.0
     offset: float = 0.0
-    exponents: tuple[tuple[str, int], ...] | None = ()
+    exponents: Mapping[str, int] | None = field(default_factory=dict)
 
     def si(self) -> dict[str, object]:
         """The attributes of FMI's BaseUnit."""
         factor = self.factor if self.factor != 1.0 else None
         offset = self.offset if self.offset != 0.0 else None
-        return {**dict(self.exponents or ()), "factor": factor, "offset": offset}
+        return {**(self.exponents or {}), "factor": factor, "offset": offset}
 
 
 _TABLE = (Path(__file__).parent / "resources" / "units.csv").read_text(encoding="utf-8")
@@ -137,8 +137,9 @@ def unit(name: str) -> Unit:
             for base, exponent in re.findall(r"([A-Za-z]+)(-?\d+)", _SIMPLE[found[1]]["exponents"]):
                 powers[base] += power * int(exponent)
     offset = Fraction(_SIMPLE[name]["offset"] if name in _SIMPLE else 0)
-    exponents = tuple((base, power) for base, power in powers.items() if power)
-    return Unit(name, float(factor), float(offset), exponents)
+    return Unit(
+        name, float(factor), float(offset), {b: power for b, power in powers.items() if power}
+    )
 
 
 @dataclass(frozen=True, eq=False)

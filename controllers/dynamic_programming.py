@@ -339,7 +339,7 @@ class BellmanOperator:
 
     def __init__(self, plant: PlantProblem, accuracy: Accuracy, *, workers: int = 1) -> None:
         problem, law = plant.problem, plant.law
-        self.problem, self.deterministic = problem, law.deterministic
+        self.problem, self.deterministic = problem, law.kind == "none" or not law.ranges.any()
         self.accuracy = accuracy
         self._step = Elementwise(
             discretise(problem.model, problem.sampling_time, accuracy.substeps)

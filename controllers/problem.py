@@ -270,11 +270,6 @@ class DisturbanceLaw:
     nominal: Vector
     ranges: Vector
 
-    @property
-    def deterministic(self) -> bool:
-        """Whether the disturbances never leave their nominal values."""
-        return self.kind == "none" or not self.ranges.any()
-
     def draw(self, generator: np.random.Generator, count: int) -> Matrix:
         """Draw `count` independent disturbances, shape (count, n_d)."""
         size = (count, len(self.nominal))

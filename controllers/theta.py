@@ -159,31 +159,29 @@ class ThetaBlocks:
         kappa, states = units.cost, units.state
         both = np.concatenate([states, units.action])
 
-        def symmetric(name: str, sizes: Vector, meaning: str) -> ThetaBlock:
-            scale = (kappa / np.outer(sizes, sizes))[upper_triangle(sizes.size)]
-            return ThetaBlock(name, (sizes.size,) * 2, tuple(scale.tolist()), meaning)
-
-        def vector(name: str, scale: Vector, meaning: str, least: ArrayLike = ()) -> ThetaBlock:
+        def block(name: str, scale: Vector, meaning: str, least: ArrayLike = ()) -> ThetaBlock:
+            packed = scale[upper_triangle(len(scale))] if scale.ndim == 2 else scale.reshape(-1)
             smallest = tuple(np.asarray(least).tolist())
-            return ThetaBlock(name, scale.shape, tuple(scale.tolist()), meaning, least=smallest)
+            return ThetaBlock(name, scale.shape, tuple(packed.tolist()), meaning, least=smallest)
 
+        of_states, of_both = (kappa / np.outer(sizes, sizes) for sizes in (states, both))
         blocks = [
-            symmetric("B_lambda", states, "initial cost, quadratic"),
-            vector("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
-            ThetaBlock("c_lambda", (), (0.1 * kappa,), "initial cost, constant"),
-            symmetric("B_Vf", states, "terminal cost, quadratic"),
-            vector("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
-            symmetric("B_l", both, "stage cost, quadratic"),
-            vector("b_l", 0.1 * kappa / both, "stage cost, linear"),
-            vector("c_f", 0.001 * states, "model offset"),
-            vector("x_l", 0.01 * states, "lower state bound"),
-            vector("x_u", 0.01 * states, "upper state bound"),
+            block("B_lambda", of_states, "initial cost, quadratic"),
+            block("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
+            block("c_lambda", np.array(0.1 * kappa), "initial cost, constant"),
+            block("B_Vf", of_states, "terminal cost, quadratic"),
+            block("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
+            block("B_l", of_both, "stage cost, quadratic"),
+            block("b_l", 0.1 * kappa / both, "stage cost, linear"),
+            block("c_f", 0.001 * states, "model offset"),
+            block("x_l", 0.01 * states, "lower state bound"),
+            block("x_u", 0.01 * states, "upper state bound"),
         ]
         if slack_weights:
             linear, quadratic, meaning = kappa / states, kappa / states**2, "slack of stages 1…N"
             blocks += [
-                vector("w_sigma", linear, f"{meaning}, linear weight", units.exact()),
-                vector("W_sigma", 1e3 * quadratic, f"{meaning}, quadratic weight", quadratic),
+                block("w_sigma", linear, f"{meaning}, linear weight", units.exact()),
+                block("W_sigma", 1e3 * quadratic, f"{meaning}, quadratic weight", quadratic),
             ]
         if model_parameters:
             indices = problem.model.parameter_indices(model_parameters)

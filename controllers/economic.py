@@ -275,16 +275,14 @@ class EconomicTuning:
         )
 
 
-def tune(
-    problem: Problem, blocks: ThetaBlocks | None = None, *, value_offset: float | None = None
-) -> EconomicTuning:
+def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     """Tune the NMPC: its local feedback becomes the economic optimum's (docs/method.md).
 
     ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B] and V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx: H̃ is the
     convexified Hessian, q the gradient along the active constraints, P the value of H̃ under γ = 1.
     λ_θ undoes the rotations by costate and storage, so that V_θ is to second order the economic
-    value. `value_offset` is c_λ where it shall not be ℓ_s. θ is rounded to six digits. Raises
-    TuningError where steady state, local optimum or convexification do not exist.
+    value; c_λ is ℓ_s. θ is rounded to six digits. Raises TuningError where steady state, local
+    optimum or convexification do not exist.
     """
     steady = optimal_steady_state(
         dataclasses.replace(problem, substeps=linearisation_substeps(problem))
@@ -313,7 +311,7 @@ def tune(
         "B_lambda": _symmetric(0.5 * initial),
         "b_lambda": steady.costate + initial @ shift[:n],
     }
-    parameters = Parameters.naive(problem, blocks, value_offset=value_offset).replace(
+    parameters = Parameters.naive(problem, blocks).replace(
         {name: _rounded(value) for name, value in values.items()}
     )
     return EconomicTuning(parameters, steady, convex, economic, tuned)

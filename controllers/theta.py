@@ -275,23 +275,16 @@ class Parameters(Shown):
         return "\n".join(lines)
 
     @classmethod
-    def naive(
-        cls,
-        problem: Problem,
-        blocks: ThetaBlocks | None = None,
-        *,
-        value_offset: float | None = None,
-    ) -> Parameters:
+    def naive(cls, problem: Problem, blocks: ThetaBlocks | None = None) -> Parameters:
         """The paper's naive guess: B_l = I, B_Vf = I, c_lambda = ℓ_s, true bounds, else 0.
 
-        `value_offset` is c_lambda where it shall not be ℓ_s, for instance ℓ_s/(1−γ). Slack weights
-        in θ start at the true penalty, model parameters at their nominal values.
+        Slack weights in θ start at the true penalty, model parameters at their nominal values.
         """
         blocks = blocks or ThetaBlocks.of(problem)
         values: dict[str, ArrayLike] = {
             "B_l": np.eye(problem.n_states + problem.n_actions),
             "B_Vf": np.eye(problem.n_states),
-            "c_lambda": problem.reference_cost if value_offset is None else value_offset,
+            "c_lambda": problem.reference_cost,
             "x_l": problem.state_lower,
             "x_u": problem.state_upper,
         }

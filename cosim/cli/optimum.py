@@ -135,13 +135,14 @@ def tuning(
 
         task = cli.load_scenario(scenario)
         problem = Problem.from_scenario(task)
-        result = tune(problem, value_offset=value_offset(task, problem))
+        result = tune(problem)
+        parameters = result.parameters.replace({"c_lambda": value_offset(task, problem)})
         steady, convex = result.steady_state, result.convexification
         rows = [tuple(line.split("  ", 1)) for line in str(result).splitlines()]
         out_.table(f"economic tuning of {scenario}", ("", "certificate"), rows)
         if out is not None:
-            result.parameters.save(out)
-            out_.note(f"θ {result.parameters.hash} is in {out.resolve()}")
+            parameters.save(out)
+            out_.note(f"θ {parameters.hash} is in {out.resolve()}")
         states, actions = steady.x.tolist(), steady.u.tolist()
         prices = (steady.C @ steady.multipliers).tolist()
         document = {
@@ -151,6 +152,6 @@ def tuning(
             "economic_eigenvalues": np.linalg.eigvalsh(steady.hessian).tolist(),
             "convexified_eigenvalues": np.linalg.eigvalsh(convex.hessian).tolist(),
             "gain_error": result.gain_error,
-            "parameters": result.parameters.hash,
+            "parameters": parameters.hash,
         }
         out_.json(document)

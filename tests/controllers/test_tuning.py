@@ -137,7 +137,7 @@ def test_rtis_local_feedback_is_the_economic_one_for_any_discount(tuning):
 
 def test_value_is_the_economic_one_to_second_order():
     problem = PROBLEMS["undiscounted"]
-    controller = RtiNmpc(problem, tune(problem, value_offset=0.0).parameters)
+    controller = RtiNmpc(problem, tune(problem).parameters.replace({"c_lambda": 0.0}))
     controller.prepare()
     solve, direction = long_economic_problem(problem), np.array([0.6, -0.8])
     errors = []

@@ -369,37 +369,17 @@ def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes])
     return _KEPT_TOKENS.get(token, token)
 
 
-def sampled_system(
-    *,
-    name: str,
-    identifier: str,
-    description: str,
-    sampling_time: float,
-    signals: Sequence[Variable],
-    sources: Mapping[str, bytes],
-    terminal: tuple[str, ...] = (),
-) -> FmuModel:
-    """The model of a function of inputs and parameters, evaluated once a `sampling_time` [s].
+def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:
+    """The variables of a sampled model, a function of inputs and parameters.
 
     `signals` are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
-    parameters; every output depends on every input and parameter. `sources` are C headers by name,
-    of which ``core.h`` defines the functions that ``sampled_sources/model_state.h`` lists; their
-    arrays are ordered like the signals. Raises BuildError on names that are taken twice, in FMI or
-    in C.
+    parameters; every output depends on every input and parameter. Raises BuildError on names that
+    are taken twice, in FMI or in C.
     """
     time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
     known = tuple(v.name for v in signals if v.settable)
     table = (time, *(v if v.settable else replace(v, uses=known) for v in signals))
     for names in ([v.name for v in table], [v.identifier for v in table]):
         if twice := next((each for each in names if names.count(each) > 1), None):
-            raise BuildError(f"two variables of {name} are called '{twice}'")
-    return FmuModel(
-        name=name,
-        identifier=identifier,
-        description=description,
-        variables=table,
-        step_size=sampling_time,
-        sampled=True,
-        terminal=terminal,
-        sources=sources,
-    )
+            raise BuildError(f"two variables are called '{twice}'")
+    return table

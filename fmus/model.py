@@ -154,8 +154,9 @@ class FmuModel:
     Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
     variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
     names. `units` gives the order of the variables' units where it shall not be the table's own.
-    `sources` are its own C headers by file name, those of a sampled model what `sampled_system`
-    says; `origin` tells in generated C where it comes from.
+    `sources` are its own C headers by file name; a sampled model's ``core.h`` defines the functions
+    that ``sampled_sources/model_state.h`` lists, with arrays in the order of the table. `origin`
+    tells in generated C where it comes from.
     """
 
     name: str

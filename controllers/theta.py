@@ -264,16 +264,6 @@ class Parameters(Shown):
         content = json.dumps([list(self.blocks.labels), [float(v).hex() for v in self.theta]])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
-    def __str__(self) -> str:
-        """One line a block: name, meaning and value to six digits."""
-        lines = [f"θ {self.hash} ({self.blocks.size} entries)"]
-        for block in self.blocks:
-            value = np.array2string(
-                self[block.name], precision=6, suppress_small=True, separator=", "
-            )
-            lines.append(f"  {block.name:9s} {block.meaning:34s} {' '.join(value.split())}")
-        return "\n".join(lines)
-
     @classmethod
     def naive(cls, problem: Problem, blocks: ThetaBlocks | None = None) -> Parameters:
         """The paper's naive guess: B_l = I, B_Vf = I, c_lambda = ℓ_s, true bounds, else 0.

@@ -143,11 +143,6 @@ class Grid:
         smooth = self.smooth or (None,) * len(self.axes)
         return [AxisInterpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
 
-    def resample(self, values: Array, other: Grid) -> Array:
-        """Values (G, k) at the states of another grid, interpolated multilinearly."""
-        x, linear = list(other.points.T), Grid(self.axes)
-        return np.stack([linear.interpolant(column)(x) for column in values.T], axis=1)
-
 
 def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
     if not offsets:
@@ -568,7 +563,9 @@ def refined(
         # Beyond a bound the value has a kink wherever the return takes one more sample.
         intervals.append((max(first, problem.state_lower[i]), min(last, problem.state_upper[i])))
     finer = Grid(tuple(axes), tuple(intervals) if smooth else None)
-    return begin(operator, finer, grid.resample(found.actions, finer), 0.1)
+    states, linear = list(finer.points.T), Grid(grid.axes)
+    actions = [linear.interpolant(column)(states) for column in found.actions.T]
+    return begin(operator, finer, np.stack(actions, axis=1), 0.1)
 
 
 Objective = Callable[[Indices, Array], Array]

@@ -86,16 +86,15 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     hessian, gradient, jacobian = (value.full() for value in derivatives(point))
     multipliers = gradient.reshape(-1)
     strict = np.flatnonzero(np.abs(multipliers) > _STRICT * max(1.0, np.abs(multipliers).max()))
-    for i in strict[strict < n]:
-        if abs(multipliers[i]) >= problem.penalty_linear[i]:
-            raise TuningError(
-                f"the penalty of {model.states[i].name} is too small: its linear weight "
-                f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
-                f"{abs(multipliers[i]):g}"
-            )
     active, quantities = [], (*model.states, *model.actions)
     for i in strict:
         quantity = quantities[i]
+        if i < n and abs(multipliers[i]) >= problem.penalty_linear[i]:
+            raise TuningError(
+                f"the penalty of {quantity.name} is too small: its linear weight "
+                f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
+                f"{abs(multipliers[i]):g}"
+            )
         relation, bound = ("≥", lower[i]) if multipliers[i] > 0 else ("≤", upper[i])
         active.append(f"{quantity.name} {relation} {bound:g} {quantity.unit}".rstrip())
     return SteadyState(

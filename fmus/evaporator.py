@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 
 from cosim.files import temporary_folder
-from fmus import BuildError, plant
+from fmus import NAMES, BuildError, plant
 from fmus.build import (
     COMPILER_FLAGS,
     HEADER,
@@ -71,12 +71,9 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
     For the platform at hand by the local compiler, or for every one by the extra ``cross``.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    faces: tuple[tuple[FmiVersion, str, str], ...] = (
-        (2, "evaporator.fmu", "model.png"),
-        (3, "evaporator_fmi3.fmu", "terminalsAndIcons/icon.png"),
-    )
+    icons: dict[FmiVersion, str] = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
     built = []
-    for version, name, icon in faces:
+    for name, (version, icon) in zip(NAMES, icons.items(), strict=True):
         files = {icon: (RESOURCES / "icon.png").read_bytes()}
         files["documentation/index.html"] = render(
             "evaporator.html",
@@ -88,16 +85,15 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
         files[BUILD_FILE] = _build_record(version, every_platform)
         if version == 3:
             files |= terminals(EVAPORATOR, icon=True)
-        built.append(
-            build_model(
-                EVAPORATOR,
-                folder / name,
-                version,
-                every_platform=every_platform,
-                files=files,
-                warnings=WARNINGS,
-            )
+        made = build_model(
+            EVAPORATOR,
+            folder / f"{name}.fmu",
+            version,
+            every_platform=every_platform,
+            files=files,
+            warnings=WARNINGS,
         )
+        built.append(made)
     return built
 
 

@@ -106,22 +106,22 @@ def solver(scenario, theta):
 
     from controllers.model import discretise
     from controllers.problem import Problem
-    from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
+    from controllers.theta import Parameters, ThetaBlocks, symbolic_theta
 
     problem = Problem.from_scenario(scenario)
     blocks = ThetaBlocks.of(problem)
     parameters = Parameters.naive(problem, blocks).with_theta(theta)
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    symbols = SymbolicTheta.of(problem, blocks)
+    symbols = symbolic_theta(problem, blocks)
     x, u, discount = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("discount")
     f = discretise(problem.model, problem.sampling_time, problem.substeps)
     x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
     w, end = ca.vertcat(x - x_s, u - u_s), x - x_s
     ocp, model = AcadosOcp(), AcadosModel()
     model.name, model.x, model.u = "controller", x, u
-    model.p = ca.vertcat(symbols.theta, discount)
+    model.p = ca.vertcat(symbols["theta"], discount)
     model.disc_dyn_expr = (
-        f(x, u, problem.model.nominal_disturbance, symbols.model_parameters) + symbols["c_f"]
+        f(x, u, problem.model.nominal_disturbance, symbols["model_parameters"]) + symbols["c_f"]
     )
     model.cost_expr_ext_cost = discount * (ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w))
     model.cost_expr_ext_cost_e = discount * (

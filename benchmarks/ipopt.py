@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.model import discretise
 from controllers.problem import Problem
-from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks, symbolic_theta
 
 Vector = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class Ocp:
     s: ca.SX
     x: ca.SX
     u: ca.SX
-    symbols: SymbolicTheta
+    symbols: dict[str, ca.SX]
     cost: ca.SX
     defects: ca.SX
     problem: Problem
@@ -40,11 +40,11 @@ class Ocp:
         model = problem.model
         f = discretise(model, problem.sampling_time, problem.substeps)
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        symbols = SymbolicTheta.of(problem, blocks)
+        symbols = symbolic_theta(problem, blocks)
         s = ca.SX.sym("s", n)
         x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
         x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
-        states = ca.horzcat(s, x)
+        states, p = ca.horzcat(s, x), symbols["model_parameters"]
         cost = problem.symbolic_penalty(s) + symbols["c_lambda"]
         cost += ca.bilin(symbols["B_lambda"], s - x_s) + ca.dot(symbols["b_lambda"], s - x_s)
         defects = []
@@ -52,7 +52,7 @@ class Ocp:
             w = ca.vertcat(states[:, k] - x_s, u[:, k] - u_s)
             stage = ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w)
             cost += problem.discount**k * stage
-            x_next = f(states[:, k], u[:, k], model.nominal_disturbance, symbols.model_parameters)
+            x_next = f(states[:, k], u[:, k], model.nominal_disturbance, p)
             defects.append(x_next + symbols["c_f"] - states[:, k + 1])
         end = states[:, horizon] - x_s
         terminal = ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
@@ -105,7 +105,7 @@ class IpoptNmpc:
             "ipopt",
             {
                 "x": z,
-                "p": ca.veccat(ocp.s, ocp.symbols.theta),
+                "p": ca.veccat(ocp.s, ocp.symbols["theta"]),
                 "f": ocp.cost + ocp.penalty_of(slack),
                 "g": ca.veccat(ocp.defects, lower, upper),
             },

@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.errors import QpError
 from controllers.problem import Problem
-from controllers.qp import NOT_CONVEX, QpBackend, QpSolution, SoftQp
+from controllers.qp import NOT_CONVEX, QpBackend
 from controllers.rti import RtiNmpc
 from controllers.rti.nmpc import RtiSolution
 from controllers.theta import Parameters
 from cosim.validation import known_keywords
-
-
-class _Known(NamedTuple):
-    """A backend that returns the solution it is given: to read out a QP already solved."""
-
-    solution: QpSolution
-
-    def load(self, qp: SoftQp) -> None: ...
-
-    def solve(self, qp: SoftQp) -> QpSolution:
-        return self.solution
 
 
 class ConvergedNmpc(RtiNmpc):
@@ -101,7 +91,8 @@ class ConvergedNmpc(RtiNmpc):
 
     def _read_out(self, s: ArrayLike, a: ArrayLike | None, solution: RtiSolution) -> RtiSolution:
         """Read a lifted QP's solution out of the programme's own QP, which need not be convex."""
-        backend, self._backend = self._backend, _Known(solution.multipliers)
+        known: Any = SimpleNamespace(load=lambda qp: None, solve=lambda qp: solution.multipliers)
+        backend, self._backend = self._backend, known
         try:
             self._linearise_at(solution.unshifted)
             return super()._solve_qp(s, a)

@@ -101,23 +101,20 @@ class Grid:
 
     def weights(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
         """Grid indices and weights of interpolation at states given as one array per entry."""
-        positions, factors = [], []
-        strides = np.cumprod((1, *self.shape[:0:-1]))[::-1]
-        for interpolant, stride, values in zip(self._interpolants, strides, x, strict=True):
+        corners: list[tuple[Indices, Array]] = [(np.zeros((), dtype=np.intp), np.ones(()))]
+        for interpolant, axis, values in zip(self._interpolants, self.axes, x, strict=True):
             cell, offset = interpolant.locate(values)
-            start = interpolant.first[cell]
-            points = interpolant.weights.shape[1]
-            positions.append([stride * (start + j) for j in range(points)])
-            factors.append(
-                [_horner(interpolant.weights[:, j], cell, [offset]) for j in range(points)]
-            )
-        result = []
-        for stencil in itertools.product(*(range(len(row)) for row in positions)):
-            index, weight = np.zeros((), dtype=np.intp), np.ones(())
-            for position, factor, j in zip(positions, factors, stencil, strict=True):
-                index, weight = index + position[j], weight * factor[j]
-            result.append((index, weight))
-        return result
+            first = interpolant.first[cell]
+            own = [
+                (first + j, _horner(interpolant.weights[:, j], cell, [offset]))
+                for j in range(interpolant.weights.shape[1])
+            ]
+            corners = [
+                (index * len(axis) + position, weight * factor)
+                for index, weight in corners
+                for position, factor in own
+            ]
+        return corners
 
     def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
         """Function that interpolates `values` (G,) at states given as one array per entry."""
@@ -145,11 +142,6 @@ class Grid:
     def _interpolants(self) -> list[AxisInterpolant]:
         smooth = self.smooth or (None,) * len(self.axes)
         return [AxisInterpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
-
-    def resample(self, values: Array, other: Grid) -> Array:
-        """Values (G, k) at the states of another grid, interpolated multilinearly."""
-        x, linear = list(other.points.T), Grid(self.axes)
-        return np.stack([linear.interpolant(column)(x) for column in values.T], axis=1)
 
 
 def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
@@ -186,23 +178,11 @@ def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: flo
     return np.concatenate([*parts, [marks[-1]]])
 
 
-class ProductRule(NamedTuple):
-    """A product quadrature rule: E[g(d)] ≈ Σ_i weights_i g(nodes_i).
-
-    `axes` holds the nodes of each disturbance; `nodes` (q, n_d) their product, the last disturbance
-    fastest; `weights` (q,) sum to 1.
-    """
-
-    axes: list[Array]
-    nodes: Array
-    weights: Array
-
-
-def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> ProductRule:
-    """Gauss rule with the given number of nodes per disturbance.
+def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> tuple[list[Array], Array]:
+    """Nodes of each disturbance, and the weights of their product, the last one's running fastest.
 
     Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one, one node for a disturbance
-    that does not vary. Exact for polynomials of degree 2·count−1 in each.
+    that does not vary. Exact for polynomials of degree 2·count−1 in each; the weights sum to 1.
     """
     axes, weights = [], np.ones(1)
     for count, nominal, spread in zip(counts, law.nominal, law.ranges, strict=True):
@@ -214,17 +194,15 @@ def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> ProductRule:
             x, w = np.polynomial.hermite_e.hermegauss(count)
         axes.append(nominal + spread * x)
         weights = np.multiply.outer(weights, w / w.sum()).reshape(-1)
-    mesh = [axis.reshape(-1) for axis in np.meshgrid(*axes, indexing="ij")]
-    return ProductRule(axes, np.stack(mesh, axis=1) if mesh else np.zeros((1, 0)), weights)
+    return axes, weights
 
 
 class Refinement:
-    """Polynomial interpolation of a smooth function from one product rule's nodes to another's."""
+    """Polynomial interpolation of a smooth function from one product of nodes to another."""
 
-    def __init__(self, coarse: ProductRule, fine: ProductRule) -> None:
-        self.weights = fine.weights
+    def __init__(self, coarse: Sequence[Array], fine: Sequence[Array]) -> None:
         self._matrices = []
-        for x, t in zip(coarse.axes, fine.axes, strict=True):
+        for x, t in zip(coarse, fine, strict=True):
             # The Lagrange polynomials of the nodes x at the targets t.
             matrix = np.ones((len(t), len(x)))
             for j, k in itertools.permutations(range(len(x)), 2):
@@ -260,7 +238,6 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_INV: lambda a: 1.0 / a,
     ca.OP_POW: np.power,
     ca.OP_CONSTPOW: np.power,
-    ca.OP_FABS: np.abs,
     ca.OP_LT: lambda a, b: np.where(a < b, 1.0, 0.0),
     ca.OP_LE: lambda a, b: np.where(a <= b, 1.0, 0.0),
     ca.OP_EQ: lambda a, b: np.where(a == b, 1.0, 0.0),
@@ -273,12 +250,9 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
         getattr(ca, f"OP_{name.upper()}"): getattr(np, name)
         for name in (
             *("exp", "log", "log1p", "expm1", "sqrt", "hypot", "sign", "floor", "ceil"),
-            *("sin", "cos", "tan", "sinh", "cosh", "tanh", "fmin", "fmax"),
+            *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
+            *("fabs", "fmin", "fmax"),
         )
-    },
-    **{
-        getattr(ca, f"OP_A{name.upper()}"): getattr(np, f"arc{name}")
-        for name in ("sin", "cos", "tan", "tan2")
     },
 }
 
@@ -360,17 +334,17 @@ class BellmanOperator:
 
     def __init__(self, plant: PlantProblem, accuracy: Accuracy, *, workers: int = 1) -> None:
         problem, law = plant.problem, plant.law
-        self.problem, self.deterministic = problem, law.deterministic
+        self.problem, self.deterministic = problem, law.kind == "none" or not law.ranges.any()
         self.accuracy = accuracy
         self._step = Elementwise(
             discretise(problem.model, problem.sampling_time, accuracy.substeps)
         )
         self._cost = Elementwise(economic_cost(problem.model))
         self._parameters = plant.parameters
-        rule = gauss_rule(law, accuracy.nodes)
-        self._weights = rule.weights
-        self._disturbance = [rule.nodes[None, :, i] for i in range(rule.nodes.shape[1])]
-        self._refine = Refinement(rule, gauss_rule(law, accuracy.penalty_nodes))
+        nodes, self._weights = gauss_rule(law, accuracy.nodes)
+        self._disturbance = [d.reshape(1, -1) for d in np.meshgrid(*nodes, indexing="ij")]
+        penalty_nodes, self._penalty_weights = gauss_rule(law, accuracy.penalty_nodes)
+        self._refine = Refinement(nodes, penalty_nodes)
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
 
     def deviation(self, state: Array, action: Array) -> Array:
@@ -444,7 +418,7 @@ class BellmanOperator:
                     penalty = (
                         problem.penalty_linear[i] + problem.penalty_quadratic[i] * violation
                     ) * violation
-                    total[near] += _mean(penalty, self._refine.weights)
+                    total[near] += _mean(penalty, self._penalty_weights)
         return total
 
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
@@ -544,15 +518,15 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
     return Grid(tuple(axes))
 
 
-def finer_grid(
+def refined(
     operator: BellmanOperator,
     found: Optimum,
     settings: Settings,
     level: int,
     *,
     smooth: bool = True,
-) -> Grid:
-    """Grid that resolves the support of a policy's distribution with cells·2^level cells a state.
+) -> Optimum:
+    """A policy on a grid that resolves its distribution's support with cells·2^level cells a state.
 
     At a bound that the closed loop touches the cells are 2^-level of the standard deviation of one
     sample's disturbance, which alone smooths the penalty's kink. The grid extends beyond the
@@ -588,7 +562,10 @@ def finer_grid(
         axes.append(graded_axis(marks, features, settings.growth))
         # Beyond a bound the value has a kink wherever the return takes one more sample.
         intervals.append((max(first, problem.state_lower[i]), min(last, problem.state_upper[i])))
-    return Grid(tuple(axes), tuple(intervals) if smooth else None)
+    finer = Grid(tuple(axes), tuple(intervals) if smooth else None)
+    states, linear = list(finer.points.T), Grid(grid.axes)
+    actions = [linear.interpolant(column)(states) for column in found.actions.T]
+    return begin(operator, finer, np.stack(actions, axis=1), 0.1)
 
 
 Objective = Callable[[Indices, Array], Array]
@@ -832,38 +809,17 @@ def solve(
     grid = first_grid(problem, draft, settings)
     iterate = begin(draft, grid, np.tile(problem.reference_action, (grid.size, 1)))
     run = partial(_iterate, settings=settings, progress=progress)
-    approach = partial(run, draft, scan_points=5, enough=_settled)
+    approach = partial(run, draft, scan_points=5, start_only=True)
     level = 0
     # Linear interpolation is monotone, so it converges from any start; it smears the closed loop
     # over its cells, so the support is known only once these are fine.
     grids = [(1, False), *((k + 1, True) for k in range(settings.level))]
     for finer, smooth in grids if settings.level else ():
-        iterate = approach(iterate, level)
-        grid = finer_grid(draft, iterate, settings, finer, smooth=smooth)
-        iterate = begin(draft, grid, iterate.grid.resample(iterate.actions, grid), 0.1)
+        iterate = refined(draft, approach(iterate, level), settings, finer, smooth=smooth)
         level = finer
     # One round that looks for better actions in the whole action box.
-    iterate = run(draft, approach(iterate, level), level, scan_points=9, enough=lambda *_: True)
-    return _accepted(run(operator, iterate, level), accuracy)
-
-
-def refine(
-    plant: PlantProblem,
-    settings: Settings,
-    optimum: Optimum,
-    *,
-    level: int,
-    progress: Progress | None = None,
-) -> Optimum:
-    """Solve again from a solution, on the grid of another level.
-
-    Raises OptimumError as `solve` does.
-    """
-    operator = BellmanOperator(plant, optimum.accuracy, workers=2)
-    start = begin(operator, optimum.grid, optimum.actions)
-    grid = finer_grid(operator, start, settings, level)
-    start = begin(operator, grid, start.grid.resample(start.actions, grid), 0.1)
-    return _accepted(_iterate(operator, start, level, settings, progress), operator.accuracy)
+    iterate = run(draft, approach(iterate, level), level, scan_points=9, rounds=1)
+    return _accepted(run(operator, iterate, level))
 
 
 def _iterate(
@@ -874,28 +830,26 @@ def _iterate(
     progress: Progress | None,
     *,
     scan_points: int = 3,
-    enough: Callable[[Optimum, Optimum], bool] | None = None,
+    rounds: int | None = None,
+    start_only: bool = False,
 ) -> Optimum:
-    """Improve and evaluate until `enough(before, after)`, without it until the bounds meet."""
+    """Improve and evaluate until the bounds meet or, where `start_only`, the gain rests."""
     anchor = iterate.grid.nearest(operator.problem.reference_state)
-    for k in range(settings.rounds):
-        before, better = iterate, improve_policy(operator, iterate, scan_points)
+    for k in range(rounds or settings.rounds):
+        before, better = iterate.gain, improve_policy(operator, iterate, scan_points)
         W, gain, distribution = evaluate_policy(operator, better.grid, better.actions, anchor)
-        iterate = replace(better, W=W, gain=gain, distribution=distribution)
+        iterate = replace(
+            better, W=W, gain=gain, distribution=distribution, accuracy=operator.accuracy
+        )
         if progress is not None:
             progress(level, k, iterate)
-        met = iterate.upper - iterate.lower <= settings.tolerance * abs(gain)
-        if enough(before, iterate) if enough else met:
+        left = before - gain if start_only else iterate.upper - iterate.lower
+        if left <= (1e-4 if start_only else settings.tolerance) * abs(gain):
             break
     return iterate
 
 
-def _settled(before: Optimum, after: Optimum) -> bool:
-    """Whether the gain falls no more: a start for the next grid needs no bounds."""
-    return before.gain - after.gain <= 1e-4 * abs(after.gain)
-
-
-def _accepted(found: Optimum, accuracy: Accuracy) -> Optimum:
+def _accepted(found: Optimum) -> Optimum:
     gain, lower, upper = found.gain, found.lower, found.upper
     if upper - lower > 0.01 * abs(gain):
         raise OptimumError(
@@ -903,7 +857,7 @@ def _accepted(found: Optimum, accuracy: Accuracy) -> Optimum:
             "1 % apart; allow more rounds or another grid"
         )
     mass, lower, upper = np.maximum(found.distribution, 0.0), min(lower, gain), max(upper, gain)
-    found = replace(found, distribution=mass, lower=lower, upper=upper, accuracy=accuracy)
+    found = replace(found, distribution=mass, lower=lower, upper=upper)
     if found.edge_mass > 1e-4:
         raise OptimumError(
             f"the optimal closed loop is on the edge of the grid's box in "
@@ -950,16 +904,18 @@ def certify(
     steps: int = 5000,
     progress: Progress | None = None,
 ) -> Optimum:
-    """A solution on the grid of the next level, with a certificate.
+    """The solution on the grid of the next level, started from a solution, with a certificate.
 
     Its figures: `solution`, the gain and its bounds on the given grid; `refinement`, those on the
     next level; `simulation`, the mean cost of the refined policy on the plant's model, 95 %; where
     it is added, `policy search`, the best θ that a search found, on the same noise. Raises
     OptimumError as `solve` does.
     """
-    refined = refine(plant, settings, optimum, level=settings.level + 1, progress=progress)
-    mean, half_width = simulate_policy(plant, refined, paths=paths, steps=steps)
-    solved = {"solution": optimum, "refinement": refined}
+    operator, level = BellmanOperator(plant, optimum.accuracy, workers=2), settings.level + 1
+    start = refined(operator, optimum, settings, level)
+    found = _accepted(_iterate(operator, start, level, settings, progress))
+    mean, half_width = simulate_policy(plant, found, paths=paths, steps=steps)
+    solved = {"solution": optimum, "refinement": found}
     figures = [Figure(name, one.gain, one.lower, one.upper) for name, one in solved.items()]
     figures.append(Figure("simulation", mean, mean - half_width, mean + half_width))
-    return replace(refined, certificate=tuple(figures))
+    return replace(found, certificate=tuple(figures))

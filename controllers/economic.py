@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import clarabel
@@ -44,11 +44,6 @@ class SteadyState:
     hessian: Array
     C: Array
     active: tuple[str, ...]
-
-    @property
-    def eigenvalues(self) -> Array:
-        """Eigenvalues of `hessian`, ascending."""
-        return np.linalg.eigvalsh(self.hessian).astype(np.float64)
 
     def __str__(self) -> str:
         return (
@@ -91,16 +86,15 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     hessian, gradient, jacobian = (value.full() for value in derivatives(point))
     multipliers = gradient.reshape(-1)
     strict = np.flatnonzero(np.abs(multipliers) > _STRICT * max(1.0, np.abs(multipliers).max()))
-    for i in strict[strict < n]:
-        if abs(multipliers[i]) >= problem.penalty_linear[i]:
-            raise TuningError(
-                f"the penalty of {model.states[i].name} is too small: its linear weight "
-                f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
-                f"{abs(multipliers[i]):g}"
-            )
     active, quantities = [], (*model.states, *model.actions)
     for i in strict:
         quantity = quantities[i]
+        if i < n and abs(multipliers[i]) >= problem.penalty_linear[i]:
+            raise TuningError(
+                f"the penalty of {quantity.name} is too small: its linear weight "
+                f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
+                f"{abs(multipliers[i]):g}"
+            )
         relation, bound = ("≥", lower[i]) if multipliers[i] > 0 else ("≤", upper[i])
         active.append(f"{quantity.name} {relation} {bound:g} {quantity.unit}".rstrip())
     return SteadyState(
@@ -117,20 +111,11 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     )
 
 
-class LocalFeedback(NamedTuple):
-    """Optimal u = K x of min Σ ½ wᵀHw, w = (x, u), x₊ = Ax + Bu, with value ½ xᵀPx.
+def local_feedback(A: Array, B: Array, H: Array, C: Array) -> tuple[Array, Array]:
+    """Gain K (m, n) of u = Kx and value P (n, n) of min Σ ½ wᵀHw, w = (x, u), x₊ = Ax + Bu, γ = 1.
 
-    `gain` K (m, n); `value` P (n, n), symmetric; both for γ = 1.
-    """
-
-    gain: Array
-    value: Array
-
-
-def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
-    """Solve the Riccati equation on the manifold C w_k = 0, k ≥ 1, of the active constraints.
-
-    A row of `C` (n_c, n+m) with an entry in u binds from k = 0 on, one of the state alone binds the
+    It solves the Riccati equation on the manifold C w_k = 0, k ≥ 1, of the active constraints. A
+    row of `C` (n_c, n+m) with an entry in u binds from k = 0 on, one of the state alone binds the
     next state. H (n+m, n+m) may be indefinite. Raises TuningError where the actions cannot keep the
     constraints, or no stabilising solution exists.
     """
@@ -167,7 +152,7 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
         raise TuningError("the active constraints, once kept, make the closed loop unstable")
     # P = stage + closedᵀ P closed: the Riccati solver's P is accurate in the gain's part only.
     P = solve_discrete_lyapunov(closed.T, stage.T @ H @ stage, method="direct")
-    return LocalFeedback(gain, _symmetric(P))
+    return gain, _symmetric(P)
 
 
 @dataclass(frozen=True)
@@ -183,11 +168,6 @@ class Convexification:
     F: Array
     alpha: float
     beta: float
-
-    @property
-    def eigenvalues(self) -> Array:
-        """Eigenvalues of H̃, ascending."""
-        return np.linalg.eigvalsh(self.hessian).astype(np.float64)
 
 
 def rotation(A: Array, B: Array, delta_P: Array) -> Array:
@@ -217,8 +197,7 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     zeros = np.zeros((triangle, 1))
     nonnegative, norm = np.zeros((1, count + 2)), np.zeros((1 + n_F, count + 2))
     nonnegative[0, 0] = norm[0, -1] = -1.0
-    for k, e in enumerate(_symmetric_basis(n_c)):
-        norm[1 + k, count - n_F + k] = -np.linalg.norm(e)
+    norm[1:, count - n_F : count] = -np.diag([np.linalg.norm(e) for e in _symmetric_basis(n_c)])
     above, below = np.hstack([-columns, zeros, zeros]), np.hstack([columns, -identity, zeros])
     constraints = np.vstack([nonnegative, norm, above, below])
     offset = np.concatenate([np.zeros(2 + n_F), -identity[:, 0], np.zeros(triangle)])
@@ -243,10 +222,10 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     F = symmetric_matrix(z[count - n_F : count], n_c) / alpha
     hessian = H + rotation(A, B, delta_P) + C.T @ F @ C
     found = Convexification(_symmetric(hessian), delta_P, F, alpha, float(z[-2]))
-    if not found.eigenvalues[0] > 0:
+    if not (least := np.linalg.eigvalsh(found.hessian)[0]) > 0:
         raise TuningError(
-            f"the convexified cost is not positive definite (smallest eigenvalue "
-            f"{found.eigenvalues[0]:.3g}, Clarabel: {status})"
+            f"the convexified cost is not positive definite (smallest eigenvalue {least:.3g}, "
+            f"Clarabel: {status})"
         )
     return found
 
@@ -260,20 +239,20 @@ def _symmetric_basis(size: int) -> list[Array]:
 class EconomicTuning:
     """Tuned θ with its certificate.
 
-    `economic` is the local optimum of the economic cost itself (γ = 1, active constraints kept),
-    `tuned` that of the convexified one.
+    `economic` is the local feedback gain (m, n) of the economic cost itself (γ = 1, active
+    constraints kept), `tuned` that of the convexified one.
     """
 
     parameters: Parameters
     steady_state: SteadyState
     convexification: Convexification
-    economic: LocalFeedback
-    tuned: LocalFeedback
+    economic: Array
+    tuned: Array
 
     @property
     def gain_error(self) -> float:
         """Largest difference between the tuned local feedback gain and the economic one."""
-        return float(np.abs(self.tuned.gain - self.economic.gain).max())
+        return float(np.abs(self.tuned - self.economic).max())
 
     def __str__(self) -> str:
         steady, convex = self.steady_state, self.convexification
@@ -286,40 +265,38 @@ class EconomicTuning:
                 f"optimal steady state  x = {_short(steady.x)}, u = {_short(steady.u)}, "
                 f"cost {steady.cost:.6g}",
                 f"strictly active       {active or 'none'}",
-                f"economic Hessian      eigenvalues {_short(steady.eigenvalues)}",
-                f"convexified Hessian   eigenvalues {_short(convex.eigenvalues)}, "
+                f"economic Hessian      eigenvalues {_short(np.linalg.eigvalsh(steady.hessian))}",
+                f"convexified Hessian   eigenvalues {_short(np.linalg.eigvalsh(convex.hessian))}, "
                 f"α = {convex.alpha:.4g}, β = {convex.beta:.4g}, F = {_short(convex.F)}",
-                f"economic gain         {_short(self.economic.gain)}",
+                f"economic gain         {_short(self.economic)}",
                 f"tuned gain            differs by {self.gain_error:.2g}",
             ]
         )
 
 
-def tune(
-    problem: Problem, blocks: ThetaBlocks | None = None, *, value_offset: float | None = None
-) -> EconomicTuning:
+def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     """Tune the NMPC: its local feedback becomes the economic optimum's (docs/method.md).
 
     ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B] and V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx: H̃ is the
     convexified Hessian, q the gradient along the active constraints, P the value of H̃ under γ = 1.
     λ_θ undoes the rotations by costate and storage, so that V_θ is to second order the economic
-    value. `value_offset` is c_λ where it shall not be ℓ_s. θ is rounded to six digits. Raises
-    TuningError where steady state, local optimum or convexification do not exist.
+    value; c_λ is ℓ_s. θ is rounded to six digits. Raises TuningError where steady state, local
+    optimum or convexification do not exist.
     """
     steady = optimal_steady_state(
         dataclasses.replace(problem, substeps=linearisation_substeps(problem))
     )
     n, A, B = problem.n_states, steady.A, steady.B
     try:
-        economic = local_feedback(A, B, steady.hessian, steady.C)
+        economic, _ = local_feedback(A, B, steady.hessian, steady.C)
         convex = convexify(A, B, steady.hessian, steady.C, 1e-3)
-        tuned = local_feedback(A, B, convex.hessian, steady.C)
+        tuned, P = local_feedback(A, B, convex.hessian, steady.C)
     except TuningError as error:
         raise TuningError(
             f"{error}. {steady}. Change the bounds so that the cost has a minimum with other "
             "bounds active, or the model's economic cost so that it has one inside them"
         ) from error
-    P, dynamics = tuned.value, np.hstack([A, B])
+    dynamics = np.hstack([A, B])
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
     q, C_x = steady.multipliers, steady.C[:, :n]
     # θ's quadratics are about the reference, the tuning's about the optimal steady state.
@@ -333,7 +310,7 @@ def tune(
         "B_lambda": _symmetric(0.5 * initial),
         "b_lambda": steady.costate + initial @ shift[:n],
     }
-    parameters = Parameters.naive(problem, blocks, value_offset=value_offset).replace(
+    parameters = Parameters.naive(problem, blocks).replace(
         {name: _rounded(value) for name, value in values.items()}
     )
     return EconomicTuning(parameters, steady, convex, economic, tuned)
@@ -392,7 +369,7 @@ def _symmetric(matrix: NDArray[np.floating[Any]]) -> Array:
     return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)
 
 
-def _short(array: Array) -> str:
+def _short(array: NDArray[np.floating[Any]]) -> str:
     """Entries to five digits, on one line."""
     rows = [_short(row) if row.ndim else f"{float(row):.5g}" for row in array]
     return f"[{', '.join(rows)}]"

@@ -50,7 +50,7 @@ def value_offset(scenario: Scenario, problem: Problem) -> float:
 def naive(scenario: Scenario, kind: str = "rti") -> RtiNmpc:
     """NMPC with the paper's naive guess, c_λ as the scenario says: baseline (a)."""
     problem = Problem.from_scenario(scenario)
-    found = Parameters.naive(problem, value_offset=value_offset(scenario, problem))
+    found = Parameters.naive(problem).replace({"c_lambda": value_offset(scenario, problem)})
     return nmpc(scenario, found, kind)
 
 
@@ -64,7 +64,8 @@ def tuned(scenario: Scenario) -> RtiNmpc:
     from controllers.economic import tune  # noqa: PLC0415
 
     problem = Problem.from_scenario(scenario)
-    return nmpc(scenario, tune(problem, value_offset=value_offset(scenario, problem)).parameters)
+    found = tune(problem).parameters.replace({"c_lambda": value_offset(scenario, problem)})
+    return nmpc(scenario, found)
 
 
 def lqr(scenario: Scenario) -> Lqr:

@@ -90,12 +90,12 @@ class StackedFunction:
         return bool(np.isfinite(self.stack).all())
 
     def part(self, name: str, memory: Vector | None = None) -> Vector:
-        """View of a result, transposed to row-major: shape (columns, rows), or flat for a column.
+        """View of a part of the memory, or of a copy of it: flat, a result with columns by columns.
 
-        It looks into the function's own memory or into a copy of it.
+        That is its transpose in row-major order, of shape (columns, rows).
         """
         flat = (self.memory if memory is None else memory)[self.places[name]]
-        rows, columns = self.shapes[name]
+        rows, columns = self.shapes.get(name, (0, 1))
         return flat if columns == 1 else flat.reshape(columns, rows)
 
 

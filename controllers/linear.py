@@ -26,7 +26,8 @@ class Lqr:
     def __init__(self, problem: Problem) -> None:
         H = tune(problem).convexification.hessian
         self.problem = problem
-        self.gain = -local_feedback(*linear_model(problem), H, np.zeros((0, len(H)))).gain
+        gain, _ = local_feedback(*linear_model(problem), H, np.zeros((0, len(H))))
+        self.gain = -gain
 
     def reset(self) -> None:
         """Do nothing: the law has no memory."""

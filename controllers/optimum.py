@@ -10,7 +10,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from math import isfinite, modf, prod
+from math import isfinite, modf
 from pathlib import Path
 from typing import Any
 
@@ -154,20 +154,15 @@ class OptimalPolicy:
         self.problem, self.optimum = plant.problem, optimum
         self._plant = plant
         self._axes = [axis.tolist() for axis in optimum.grid.axes]
-        sizes = [len(axis) for axis in self._axes]
-        self._strides = [prod(sizes[i + 1 :]) for i in range(len(sizes))]
         self._table = np.column_stack([optimum.actions, optimum.W]).tolist()
-        self._corners = [
-            (corner, sum(s for s, high in zip(self._strides, corner, strict=True) if high))
-            for corner in itertools.product((False, True), repeat=len(self._axes))
-        ]
+        corners = itertools.product((0, 1), repeat=len(self._axes))
+        self._corners = [(c, int(np.ravel_multi_index(c, optimum.grid.shape))) for c in corners]
 
     @classmethod
     def from_scenario(
         cls,
         scenario: Scenario,
         *,
-        overrides: Mapping[str, float | None] | None = None,
         progress: Progress | None = None,
     ) -> OptimalPolicy:
         """Optimal policy of a scenario: shipped, cached, or solved now and cached.
@@ -175,7 +170,7 @@ class OptimalPolicy:
         The plant is that of `PlantProblem.from_scenario`, whose errors are raised; OptimumError
         also where a stored file is damaged.
         """
-        plant = PlantProblem.from_scenario(scenario, overrides)
+        plant = PlantProblem.from_scenario(scenario)
         key = optimum_key(plant, Settings())
         path = stored_file(key) or keep(key, solve(plant, progress=progress))
         return cls(plant, read_optimum(path, key))
@@ -229,12 +224,12 @@ class OptimalPolicy:
     def _lookup(self, state: list[float]) -> tuple[list[float], bool]:
         """Row (action…, W) interpolated at a state in plain Python: a tenth of NumPy's time."""
         base, clamped, fractions = 0, False, []
-        for x, axis, stride in zip(state, self._axes, self._strides, strict=True):
+        for x, axis in zip(state, self._axes, strict=True):
             cell = min(max(bisect_right(axis, x) - 1, 0), len(axis) - 2)
             fraction = (x - axis[cell]) / (axis[cell + 1] - axis[cell])
             if not 0.0 <= fraction <= 1.0:
                 fraction, clamped = min(max(fraction, 0.0), 1.0), True
-            base += cell * stride
+            base = base * len(axis) + cell
             fractions.append(fraction)
         row = [0.0] * len(self._table[0])
         for corner, offset in self._corners:
@@ -250,103 +245,95 @@ class OptimalPolicy:
 # a plant that changes -------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Fouling:
-    """p(τ) = p_clean (floor + (1 − floor) e^(−rate·τ)), τ days since the last cleaning.
+def fouling(scenario: Scenario) -> tuple[str, Callable[[ArrayLike], Vector]] | None:
+    """The plant's parameter p that fouls, the first uncertain one of its model, and p(t); or None.
 
-    `parameter` names p, the first that the plant's model calls uncertain; `clean` is its value
-    after a cleaning, `rate` is in 1/d, `floor` the share of p that fouling leaves, `period` of
-    the cleaning in d.
+    p(t) = p_clean (floor + (1 − floor) e^(−rate·τ)), t in s, τ days since the last cleaning. Raises
+    OptimumError where there is no cleaning or no uncertain parameter.
     """
-
-    parameter: str
-    clean: float
-    rate: float
-    floor: float
-    period: float
-
-    @classmethod
-    def from_scenario(cls, scenario: Scenario) -> Fouling | None:
-        """Fouling law of a scenario's condenser, or None."""
-        given = scenario.plant.parameters
-        rate, floor, period = (
-            float(given.get(name, default))
-            for name, default in zip(FOULING, (0.0, 0.7, 0.0), strict=True)
+    given = scenario.plant.parameters
+    rate, floor, period = (
+        float(given.get(name, default))
+        for name, default in zip(FOULING, (0.0, 0.7, 0.0), strict=True)
+    )
+    if rate == 0.0 or floor == 1.0:
+        return None
+    if not period > 0.0:
+        raise OptimumError(
+            "the quasi-static optimum needs a condenser that is cleaned: set "
+            "plant.parameters.cleaning_period above 0"
         )
-        if rate == 0.0 or floor == 1.0:
-            return None
-        if not period > 0.0:
-            raise OptimumError(
-                "the quasi-static optimum needs a condenser that is cleaned: set "
-                "plant.parameters.cleaning_period above 0"
-            )
-        model = load_model(scenario.plant.model or scenario.controller.model)
-        if not model.uncertain:
-            raise OptimumError(f"model '{model.name}' names no uncertain parameter that could foul")
-        name = model.uncertain[0]
-        return cls(name, _parameter(scenario, model, name), rate, floor, period)
+    model = load_model(scenario.plant.model or scenario.controller.model)
+    if not model.uncertain:
+        raise OptimumError(f"model '{model.name}' names no uncertain parameter that could foul")
+    name = model.uncertain[0]
+    clean = _parameter(scenario, model, name)
 
-    def heat_transfer(self, days: ArrayLike) -> Vector:
-        """The fouled parameter at a number of days since the start, clean at 0."""
-        since = np.mod(days, self.period)
-        return self.clean * (self.floor + (1.0 - self.floor) * np.exp(-self.rate * since))
+    def value(time: ArrayLike) -> Vector:
+        since = np.mod(np.asarray(time) / DAY, period)
+        return np.asarray(clean * (floor + (1.0 - floor) * np.exp(-rate * since)))
 
-    def present(self, time: float) -> dict[str, float]:
-        """The parameter by name at a time in s."""
-        return {self.parameter: float(self.heat_transfer(time / DAY))}
-
-    def change(self) -> Change:
-        """The law between six values of the parameter, from fouled to clean, over one cycle."""
-        fouled = self.clean * (self.floor + (1 - self.floor) * np.exp(-self.rate * self.period))
-        nodes = np.linspace(fouled, self.clean, NODES).round(6).tolist()
-        x, weights = np.polynomial.legendre.leggauss(40)
-
-        def position(time: ArrayLike) -> Vector:
-            values = self.heat_transfer(np.asarray(time) / DAY)
-            return np.asarray(np.interp(values, nodes, np.arange(NODES)), dtype=np.float64)
-
-        return Change(
-            [{self.parameter: value, **dict.fromkeys(FOULING)} for value in nodes],
-            position,
-            times=0.5 * self.period * DAY * (x + 1.0),
-            weights=weights / 2.0,
-        )
+    return name, value
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change that the reference knows, among plants that stay as they are.
+    """A change that the reference knows, among `plants` that stay as they are.
 
-    `plants` are their parameters; `position` says where among them the plant is at times in s: 1.5
-    is midway between 1 and 2. A mean over time is that over `times` in s with `weights`.
+    `parameters` are the values of what changes, by name; `position` says where among the plants the
+    changing one is at times in s: 1.5 is midway between 1 and 2. A mean over time is that over
+    `times` in s with `weights`.
     """
 
-    plants: Sequence[Mapping[str, float | None]]
+    plants: Sequence[Scenario]
+    parameters: Mapping[str, Sequence[float]]
     position: Callable[[ArrayLike], Vector]
     times: Vector
     weights: Vector
 
 
 def change_of(scenario: Scenario) -> Change | None:
-    """Change of a scenario's plant, or None; raises OptimumError where it has two."""
-    fouling, changes = Fouling.from_scenario(scenario), scenario.plant.changes
-    if fouling and changes:
+    """Change of a scenario's plant, or None; raises OptimumError where it has two.
+
+    A parameter that fouls goes through six values, from fouled to clean, in a cycle of cleaning.
+    """
+    fouled, changes = fouling(scenario), scenario.plant.changes
+    if fouled and changes:
         raise OptimumError("a condenser that fouls and plant.changes have no common reference")
+    if fouled:
+        name, value = fouled
+        cycle = DAY * scenario.plant.parameters["cleaning_period"]
+        nodes = np.linspace(value(cycle - 1e-6), value(0.0), NODES).round(6).tolist()
+        x, weights = np.polynomial.legendre.leggauss(40)
+        return Change(
+            [_frozen(scenario, name, node) for node in nodes],
+            {name: nodes},
+            lambda time: np.asarray(np.interp(value(time), nodes, range(NODES)), dtype=np.float64),
+            times=0.5 * cycle * (x + 1.0),
+            weights=weights / 2.0,
+        )
     if not changes:
-        return None if fouling is None else fouling.change()
+        return None
     model = load_model(scenario.plant.model or scenario.controller.model)
     names = dict.fromkeys(name for change in changes for name in change.parameters)
     starts = np.array([0.0, *(change.time for change in changes)])
-
-    def position(time: ArrayLike) -> Vector:
-        return np.asarray(np.searchsorted(starts, time, side="right") - 1, dtype=np.float64)
-
+    plants = [scenario.at(start) for start in starts.tolist()]
     return Change(
-        [{n: _parameter(scenario.at(start), model, n) for n in names} for start in starts.tolist()],
-        position,
+        plants,
+        {name: [_parameter(plant, model, name) for plant in plants] for name in names},
+        lambda time: np.asarray(np.searchsorted(starts, time, side="right") - 1, dtype=np.float64),
         times=starts[:-1],
         weights=np.diff(starts) / starts[-1],
     )
+
+
+def _frozen(scenario: Scenario, name: str, value: float) -> Scenario:
+    """The scenario without fouling, its fouled parameter at a value."""
+    document = scenario.to_dict()
+    given = document["plant"]["parameters"]
+    kept = {key: each for key, each in given.items() if key not in FOULING}
+    document["plant"]["parameters"] = kept | {name: value}
+    return Scenario.from_dict(document)
 
 
 def _parameter(scenario: Scenario, model: Model, name: str) -> float:
@@ -380,17 +367,13 @@ class QuasiStaticPolicy:
         """Policy of a changing scenario; solves missing optima. Raises OptimumError."""
         law = change_of(scenario)
         assert law is not None
-        policies = [
-            OptimalPolicy.from_scenario(scenario, overrides=plant, progress=progress)
-            for plant in law.plants
-        ]
+        policies = [OptimalPolicy.from_scenario(plant, progress=progress) for plant in law.plants]
         return cls(law, policies, scenario.sampling_time)
 
     @property
-    def gains(self) -> list[tuple[Mapping[str, float | None], float]]:
-        """(plant parameters, J* of that plant), in the order of the law's plants."""
-        gains = (policy.gain for policy in self.policies)
-        return list(zip(self.law.plants, gains, strict=True))
+    def gains(self) -> list[float]:
+        """J* of each of the law's plants."""
+        return [policy.gain for policy in self.policies]
 
     @property
     def gain(self) -> float:
@@ -401,8 +384,8 @@ class QuasiStaticPolicy:
         """J* of the plant as it is at times in s, between the nodes by monotone cubics."""
         from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second
 
-        gains = [policy.gain for policy in self.policies]
-        found: Vector = PchipInterpolator(np.arange(len(gains)), gains)(self.law.position(time))
+        nodes = np.arange(len(self.policies))
+        found: Vector = PchipInterpolator(nodes, self.gains)(self.law.position(time))
         return found
 
     def reset(self) -> None:
@@ -438,10 +421,7 @@ def stored_optimum(scenario: Scenario) -> str | None:
         return None
     law = change_of(scenario)
     try:
-        plants = [
-            PlantProblem.from_scenario(scenario, parameters)
-            for parameters in ([None] if law is None else law.plants)
-        ]
+        plants = [PlantProblem.from_scenario(each) for each in (law.plants if law else [scenario])]
     except (ModelError, OptimumError):
         return None
     stored = all(stored_file(optimum_key(plant, Settings())) for plant in plants)

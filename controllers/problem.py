@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -271,11 +270,6 @@ class DisturbanceLaw:
     nominal: Vector
     ranges: Vector
 
-    @property
-    def deterministic(self) -> bool:
-        """Whether the disturbances never leave their nominal values."""
-        return self.kind == "none" or not self.ranges.any()
-
     def draw(self, generator: np.random.Generator, count: int) -> Matrix:
         """Draw `count` independent disturbances, shape (count, n_d)."""
         size = (count, len(self.nominal))
@@ -298,10 +292,8 @@ class PlantProblem:
     parameters: Vector
 
     @classmethod
-    def from_scenario(
-        cls, scenario: Scenario, overrides: Mapping[str, float | None] | None = None
-    ) -> PlantProblem:
-        """The problem of a scenario; `overrides` replaces plant parameters by name, None omits one.
+    def from_scenario(cls, scenario: Scenario) -> PlantProblem:
+        """The problem of a scenario.
 
         The plant's model is `plant.model`, else the controller's. Raises OptimumError where it does
         not fit the plant, ModelError where it cannot be loaded.
@@ -321,9 +313,7 @@ class PlantProblem:
         nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
         ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
         parameters = {quantity.name: quantity.nominal for quantity in model.parameters}
-        for name, value in {**plant.parameters, **(overrides or {})}.items():
-            if value is None:
-                continue
+        for name, value in plant.parameters.items():
             if name not in parameters:
                 raise OptimumError(
                     f"{needed}: plant.parameters sets '{name}', which model '{model.name}' does "

@@ -305,11 +305,9 @@ class DaqpBackend:
         """Factorise H and transform the rows; the first call allocates the workspace."""
         n, rows = qp.f.size, qp.w.size
         if self._model is None:
-            self._lower, self._upper = np.zeros(n + rows), np.zeros(n + rows)
-            self._parts = (self._lower[:n], self._upper[:n], self._lower[n:], self._upper[n:])
+            self._lower, self._upper = np.zeros((2, n + rows))
             self._free = np.repeat(np.array([0, SOFT], dtype=np.int32), [n, rows])
             self._sense = self._free.copy()
-            self._bounds_sense = self._sense[:n]
             self._model = daqp.Model()
             self._model.settings = SETTINGS
             self._write_limits(qp)
@@ -333,9 +331,9 @@ class DaqpBackend:
         self._model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
 
     def _write_limits(self, qp: SoftQp) -> None:
-        lower, upper, row_lower, row_upper = self._parts
-        lower[:], upper[:] = qp.lower, qp.upper
-        row_lower[:], row_upper[:] = qp.row_lower, qp.row_upper
+        n = qp.f.size
+        self._lower[:n], self._lower[n:] = qp.lower, qp.row_lower
+        self._upper[:n], self._upper[n:] = qp.upper, qp.row_upper
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the vectors of `qp`; raises QpError where DAQP does not."""
@@ -343,7 +341,7 @@ class DaqpBackend:
         self._failed = True
         if flag >= 0:
             self._write_limits(qp)
-            np.multiply(qp.lower == qp.upper, FIXED, out=self._bounds_sense)
+            np.multiply(qp.lower == qp.upper, FIXED, out=self._sense[:n])
             flag = self._model.update(
                 f=qp.f, bupper=self._upper, blower=self._lower, sense=self._sense
             )

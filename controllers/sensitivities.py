@@ -17,7 +17,7 @@ from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.rti.preparation import stage_parameter_gradient
-from controllers.theta import SymbolicTheta, ThetaBlocks
+from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
 from cosim.protocols import Matrix
 
 SOLUTION = ("xi", "t", "chi", "v", "lam")
@@ -25,7 +25,7 @@ SOLUTION = ("xi", "t", "chi", "v", "lam")
 
 
 def _theta_part(
-    problem: Problem, symbols: SymbolicTheta, y: Mapping[str, ca.SX], at: ca.SX, M: ca.SX | None
+    problem: Problem, symbols: Symbols, y: Mapping[str, ca.SX], at: ca.SX, M: ca.SX | None
 ) -> ca.SX:
     """Terms of the Lagrangian with θ but for p; `at` (n+m, N), M_k = ∂(second-order term)/∂L_k.
 
@@ -66,7 +66,7 @@ def sensitivities(
     second also dM, the directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    symbols = SymbolicTheta.of(problem, blocks)
+    symbols = symbolic_theta(problem, blocks)
     columns = {"xi": horizon + 1, "v": horizon, "t": horizon, "lam": horizon, "chi": horizon + 1}
     y = {name: ca.SX.sym(name, m if name == "v" else n, c) for name, c in columns.items()}
     x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
@@ -74,17 +74,17 @@ def sensitivities(
     guess = ca.SX.sym("guess", n, horizon)
     extra = {"M": M, "guess": guess} if exact else {}
     part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
-    gradient = ca.gradient(part, symbols.theta)
+    gradient = ca.gradient(part, symbols["theta"])
     if "p" in blocks:
         of_stage = stage_parameter_gradient(problem, blocks, exact=exact)
         total = ca.SX(0)
         for k in range(horizon):
             w = ca.vertcat(y["xi"][:, k], y["v"][:, k]) + ca.DM(problem.reference)
             curved = [M[:, k * (n + m) : (k + 1) * (n + m)], guess[:, k]] if exact else []
-            total += of_stage(x[:, k], u[:, k], symbols.theta, w, y["chi"][:, k + 1], *curved)
+            total += of_stage(x[:, k], u[:, k], symbols["theta"], w, y["chi"][:, k + 1], *curved)
         gradient[blocks.slices["p"]] = total
     solution = {name: y[name] for name in SOLUTION}
-    inputs = {**solution, "x": x, "u": u, "theta": symbols.theta, **extra}
+    inputs = {**solution, "x": x, "u": u, "theta": symbols["theta"], **extra}
     value = StackedFunction("value_gradient", inputs, {"gradient": gradient})
 
     @cache

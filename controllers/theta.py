@@ -159,31 +159,29 @@ class ThetaBlocks:
         kappa, states = units.cost, units.state
         both = np.concatenate([states, units.action])
 
-        def symmetric(name: str, sizes: Vector, meaning: str) -> ThetaBlock:
-            scale = (kappa / np.outer(sizes, sizes))[upper_triangle(sizes.size)]
-            return ThetaBlock(name, (sizes.size,) * 2, tuple(scale.tolist()), meaning)
-
-        def vector(name: str, scale: Vector, meaning: str, least: ArrayLike = ()) -> ThetaBlock:
+        def block(name: str, scale: Vector, meaning: str, least: ArrayLike = ()) -> ThetaBlock:
+            packed = scale[upper_triangle(len(scale))] if scale.ndim == 2 else scale.reshape(-1)
             smallest = tuple(np.asarray(least).tolist())
-            return ThetaBlock(name, scale.shape, tuple(scale.tolist()), meaning, least=smallest)
+            return ThetaBlock(name, scale.shape, tuple(packed.tolist()), meaning, least=smallest)
 
+        of_states, of_both = (kappa / np.outer(sizes, sizes) for sizes in (states, both))
         blocks = [
-            symmetric("B_lambda", states, "initial cost, quadratic"),
-            vector("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
-            ThetaBlock("c_lambda", (), (0.1 * kappa,), "initial cost, constant"),
-            symmetric("B_Vf", states, "terminal cost, quadratic"),
-            vector("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
-            symmetric("B_l", both, "stage cost, quadratic"),
-            vector("b_l", 0.1 * kappa / both, "stage cost, linear"),
-            vector("c_f", 0.001 * states, "model offset"),
-            vector("x_l", 0.01 * states, "lower state bound"),
-            vector("x_u", 0.01 * states, "upper state bound"),
+            block("B_lambda", of_states, "initial cost, quadratic"),
+            block("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
+            block("c_lambda", np.array(0.1 * kappa), "initial cost, constant"),
+            block("B_Vf", of_states, "terminal cost, quadratic"),
+            block("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
+            block("B_l", of_both, "stage cost, quadratic"),
+            block("b_l", 0.1 * kappa / both, "stage cost, linear"),
+            block("c_f", 0.001 * states, "model offset"),
+            block("x_l", 0.01 * states, "lower state bound"),
+            block("x_u", 0.01 * states, "upper state bound"),
         ]
         if slack_weights:
             linear, quadratic, meaning = kappa / states, kappa / states**2, "slack of stages 1…N"
             blocks += [
-                vector("w_sigma", linear, f"{meaning}, linear weight", units.exact()),
-                vector("W_sigma", 1e3 * quadratic, f"{meaning}, quadratic weight", quadratic),
+                block("w_sigma", linear, f"{meaning}, linear weight", units.exact()),
+                block("W_sigma", 1e3 * quadratic, f"{meaning}, quadratic weight", quadratic),
             ]
         if model_parameters:
             indices = problem.model.parameter_indices(model_parameters)
@@ -266,34 +264,17 @@ class Parameters(Shown):
         content = json.dumps([list(self.blocks.labels), [float(v).hex() for v in self.theta]])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
-    def __str__(self) -> str:
-        """One line a block: name, meaning and value to six digits."""
-        lines = [f"θ {self.hash} ({self.blocks.size} entries)"]
-        for block in self.blocks:
-            value = np.array2string(
-                self[block.name], precision=6, suppress_small=True, separator=", "
-            )
-            lines.append(f"  {block.name:9s} {block.meaning:34s} {' '.join(value.split())}")
-        return "\n".join(lines)
-
     @classmethod
-    def naive(
-        cls,
-        problem: Problem,
-        blocks: ThetaBlocks | None = None,
-        *,
-        value_offset: float | None = None,
-    ) -> Parameters:
+    def naive(cls, problem: Problem, blocks: ThetaBlocks | None = None) -> Parameters:
         """The paper's naive guess: B_l = I, B_Vf = I, c_lambda = ℓ_s, true bounds, else 0.
 
-        `value_offset` is c_lambda where it shall not be ℓ_s, for instance ℓ_s/(1−γ). Slack weights
-        in θ start at the true penalty, model parameters at their nominal values.
+        Slack weights in θ start at the true penalty, model parameters at their nominal values.
         """
         blocks = blocks or ThetaBlocks.of(problem)
         values: dict[str, ArrayLike] = {
             "B_l": np.eye(problem.n_states + problem.n_actions),
             "B_Vf": np.eye(problem.n_states),
-            "c_lambda": problem.reference_cost if value_offset is None else value_offset,
+            "c_lambda": problem.reference_cost,
             "x_l": problem.state_lower,
             "x_u": problem.state_upper,
         }
@@ -348,36 +329,26 @@ class Parameters(Shown):
         return parameters
 
 
-@dataclass(frozen=True)
-class SymbolicTheta:
-    """θ as one symbol; `symbols["B_l"]` is a whole block, or the problem's constant without one.
+Symbols = dict[str, ca.SX]
 
-    `theta` (n_θ,) is the symbol, `unpacked` holds the blocks by name, and `model_parameters` (n_p,)
-    are the model's, with θ's own in their places.
+
+def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
+    """Symbol `theta` (n_θ,), its blocks by name, and `model_parameters` (n_p,) with θ's own in it.
+
+    A slack weight that is no block is the problem's constant.
     """
-
-    theta: ca.SX
-    unpacked: dict[str, ca.SX]
-    model_parameters: ca.SX
-
-    def __getitem__(self, name: str) -> ca.SX:
-        return self.unpacked[name]
-
-    @classmethod
-    def of(cls, problem: Problem, blocks: ThetaBlocks) -> SymbolicTheta:
-        """Symbols for these blocks of θ."""
-        theta = ca.SX.sym("theta", blocks.size)
-        unpacked = {}
-        for block in blocks:
-            part = theta[blocks.slices[block.name]]
-            if block.symmetric:
-                place = block.unpack(np.arange(float(block.size))).astype(int)
-                part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
-            unpacked[block.name] = part
-        unpacked.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
-        unpacked.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
-        parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
-        if "p" in blocks:
-            for i, index in enumerate(problem.model.parameter_indices(blocks.block("p").labels)):
-                parameters[index] = unpacked["p"][i]
-        return cls(theta, unpacked, parameters)
+    theta = ca.SX.sym("theta", blocks.size)
+    symbols = {"theta": theta}
+    for block in blocks:
+        part = theta[blocks.slices[block.name]]
+        if block.symmetric:
+            place = block.unpack(np.arange(float(block.size))).astype(int)
+            part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
+        symbols[block.name] = part
+    symbols.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
+    symbols.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
+    parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
+    if "p" in blocks:
+        for i, index in enumerate(problem.model.parameter_indices(blocks.block("p").labels)):
+            parameters[index] = symbols["p"][i]
+    return symbols | {"model_parameters": parameters}

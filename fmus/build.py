@@ -32,7 +32,6 @@ from fmus.model import (
     model_description,
     render,
     terminals,
-    unit,
 )
 
 PACKAGE = Path(__file__).parent
@@ -297,45 +296,57 @@ def files_of(folder: str) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (PACKAGE / folder).glob("*.h")}
 
 
-def sources_of(
-    model: FmuModel, version: FmiVersion, own: Mapping[str, bytes], origin: str = ""
-) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own.
-
-    `own` is the model's own C; `origin` says in the header where it comes from.
-    """
+def sources_of(model: FmuModel, version: FmiVersion) -> dict[str, bytes]:
+    """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own."""
     paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
     paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
-    files = {path.name: path.read_bytes() for path in paths} | dict(own)
-    variables = model.variables
-    if model.sampled:  # the C checks every variable against a range
-        most = sys.float_info.max
-        variables = tuple(
-            replace(v, min=-most if v.min is None else v.min, max=most if v.max is None else v.max)
-            for v in variables
-        )
-    origin = f"from {origin or f'the table of {model.name}'}"
-    token = token_of(model, version, files)
-    files[HEADER] = c_header(token, model.identifier, variables, origin).encode()
+    files = {path.name: path.read_bytes() for path in paths}
+    if model.sampled:
+        files |= _sampled_sources(model, version)
+    files |= model.sources
+    files[HEADER] = c_header(token_of(model, version, files), model).encode()
     files["buildDescription.xml"] = build_description(version, model).encode()
     return files
 
 
-def assemble(
+def _sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
+    kinds = [variable.kind for variable in system.variables]
+    first_output = 1 + kinds.count(Kind.INPUT)
+    header = render(
+        "system.h",
+        first_output=first_output,
+        first_parameter=first_output + kinds.count(Kind.OUTPUT),
+        sampling_time=float(system.step_size),
+    )
+    own = files_of("sampled_sources") | {"system.h": header.encode()}
+    if version == 3:  # its functions for scalars, and the adapter for the model's arrays
+        elements = dict.fromkeys(range(len(kinds)), (1, 0))
+        for array in system.arrays.values():
+            places = [system.value_reference(variable.name) for variable in array]
+            for k, place in enumerate(places):
+                elements[place] = (0 if k else len(places), places[(k + 1) % len(places)])
+        own["arrays.h"] = render("arrays.h", model=system, elements=elements.values()).encode()
+        last = b'#include "snapshot.h"\n'
+        scalars = (SOURCES / "fmi3.c").read_bytes()
+        own["fmi3.c"] = scalars.replace(last, last + b'#include "arrays.h"\n')
+    return own
+
+
+def build_model(
     model: FmuModel,
-    version: FmiVersion,
-    sources: Mapping[str, bytes],
     target: str | Path,
+    version: FmiVersion = 2,
     *,
     every_platform: bool = False,
     files: Mapping[str, bytes] | None = None,
     warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
-    """Build the FMU `target` from `sources_of`, with a page of its variables.
+    """Build the FMU `target` of a model, with a page of its variables.
 
     `files` are further members of the archive. As `build_fmu`, whose BuildError it raises; with the
     same compiler the bytes repeat.
     """
+    sources = sources_of(model, version)
     page = render("model.html", model=model, version=version)
     members = {
         "documentation/index.html": page.encode(),
@@ -358,78 +369,17 @@ def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes])
     return _KEPT_TOKENS.get(token, token)
 
 
-def sampled_system(
-    *,
-    name: str,
-    identifier: str,
-    description: str,
-    sampling_time: float,
-    signals: Sequence[Variable],
-    sources: Mapping[str, bytes],
-    terminal: tuple[str, ...] = (),
-) -> FmuModel:
-    """The model of a function of inputs and parameters, evaluated once a `sampling_time` [s].
+def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:
+    """The variables of a sampled model, a function of inputs and parameters.
 
     `signals` are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
-    parameters; every output depends on every input and parameter. `sources` are C headers by name,
-    of which ``core.h`` defines the functions that ``sampled_sources/model_state.h`` lists; their
-    arrays are ordered like the signals. Raises BuildError on names that are taken twice, in FMI or
-    in C.
+    parameters; every output depends on every input and parameter. Raises BuildError on names that
+    are taken twice, in FMI or in C.
     """
     time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
     known = tuple(v.name for v in signals if v.settable)
     table = (time, *(v if v.settable else replace(v, uses=known) for v in signals))
     for names in ([v.name for v in table], [v.identifier for v in table]):
         if twice := next((each for each in names if names.count(each) > 1), None):
-            raise BuildError(f"two variables of {name} are called '{twice}'")
-    return FmuModel(
-        name=name,
-        identifier=identifier,
-        description=description,
-        variables=table,
-        units=tuple(unit(each) for each in dict.fromkeys(v.unit for v in table) if each),
-        step_size=sampling_time,
-        sampled=True,
-        terminal=terminal,
-        sources=sources,
-    )
-
-
-def sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of a sampled system's FMU."""
-    kinds = [variable.kind for variable in system.variables]
-    first_output = 1 + kinds.count(Kind.INPUT)
-    header = render(
-        "system.h",
-        first_output=first_output,
-        first_parameter=first_output + kinds.count(Kind.OUTPUT),
-        sampling_time=float(system.step_size),
-    )
-    own = files_of("sampled_sources") | {**system.sources, "system.h": header.encode()}
-    if version == 3:  # its functions for scalars, and the adapter for the model's arrays
-        elements = dict.fromkeys(range(len(kinds)), (1, 0))
-        for array in system.arrays.values():
-            places = [system.value_reference(variable.name) for variable in array]
-            for k, place in enumerate(places):
-                elements[place] = (0 if k else len(places), places[(k + 1) % len(places)])
-        own["arrays.h"] = render("arrays.h", model=system, elements=elements.values()).encode()
-        last = b'#include "snapshot.h"\n'
-        scalars = (SOURCES / "fmi3.c").read_bytes()
-        own["fmi3.c"] = scalars.replace(last, last + b'#include "arrays.h"\n')
-    return sources_of(system, version, own)
-
-
-def build_sampled(
-    system: FmuModel,
-    target: str | Path,
-    version: FmiVersion = 2,
-    *,
-    every_platform: bool = False,
-    files: Mapping[str, bytes] | None = None,
-) -> Path:
-    """Build the FMU `target` of a sampled system; `files` are further members of the archive.
-
-    As `build_fmu`, whose BuildError it raises; with the same compiler the bytes repeat.
-    """
-    sources = sampled_sources(system, version)
-    return assemble(system, version, sources, target, every_platform=every_platform, files=files)
+            raise BuildError(f"two variables are called '{twice}'")
+    return table

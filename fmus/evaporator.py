@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 
 from cosim.files import temporary_folder
-from fmus import BuildError, plant
+from fmus import NAMES, BuildError, plant
 from fmus.build import (
     COMPILER_FLAGS,
     HEADER,
@@ -15,19 +15,17 @@ from fmus.build import (
     RESOURCES,
     SOURCES,
     WARNINGS,
-    assemble,
+    build_model,
     compilers,
+    files_of,
     sources_of,
     token_of,
 )
-from fmus.model import FmiVersion, FmuModel, read_variables, render, terminals, unit
+from fmus.model import FmiVersion, FmuModel, read_variables, render, terminals
 
-UNITS = tuple(
-    unit(name)
-    for name in (
-        "1", "s", "d", "1/d", "%", "%/s", "kg", "kPa", "kPa/s", "kg/min", "kg/kPa", "degC", "K",
-        "K/kPa", "K/%", "kW", "kW/K", "kW.min/kg", "kW.min/(kg.K)",
-    )
+UNITS = (
+    "1", "s", "d", "1/d", "%", "%/s", "kg", "kPa", "kPa/s", "kg/min", "kg/kPa", "degC", "K",
+    "K/kPa", "K/%", "kW", "kW/K", "kW.min/kg", "kW.min/(kg.K)",
 )  # fmt: skip
 
 VARIABLES = tuple(read_variables(RESOURCES / "evaporator.csv"))
@@ -37,23 +35,17 @@ EVAPORATOR = FmuModel(
     identifier="evaporator",
     description="Stochastic evaporation process, the plant of the RTI co-simulation benchmark",
     variables=VARIABLES,
-    units=UNITS,
     step_size=60.0,
     model_exchange=True,
     derivatives=True,
     terminal=("X2", "P2", "P100", "F200"),
+    units=UNITS,
+    sources={name: data for name, data in files_of("sources").items() if name != HEADER},
+    origin="fmus/evaporator.py by `cosim fmu build --in-place`",
 )
 
 
 BUILD_FILE = "extra/org.rti-cosim/build.json"
-
-
-def sources(version: FmiVersion) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of the FMU, generated files included."""
-    others = (HEADER, "fmi3.c" if version == 2 else "fmi2.c")
-    own = {p.name: p.read_bytes() for p in SOURCES.glob("*.[ch]") if p.name not in others}
-    origin = "fmus/evaporator.py by `cosim fmu build --in-place`"
-    return sources_of(EVAPORATOR, version, own, origin=origin)
 
 
 def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
@@ -68,7 +60,7 @@ def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
             }
             for compiler in compilers(every_platform)
         },
-        "model_token": token_of(EVAPORATOR, version, sources(version)),
+        "model_token": token_of(EVAPORATOR, version, sources_of(EVAPORATOR, version)),
     }
     return (json.dumps(record, indent=2) + "\n").encode()
 
@@ -79,12 +71,9 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
     For the platform at hand by the local compiler, or for every one by the extra ``cross``.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    faces: tuple[tuple[FmiVersion, str, str], ...] = (
-        (2, "evaporator.fmu", "model.png"),
-        (3, "evaporator_fmi3.fmu", "terminalsAndIcons/icon.png"),
-    )
+    icons: dict[FmiVersion, str] = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
     built = []
-    for version, name, icon in faces:
+    for name, (version, icon) in zip(NAMES, icons.items(), strict=True):
         files = {icon: (RESOURCES / "icon.png").read_bytes()}
         files["documentation/index.html"] = render(
             "evaporator.html",
@@ -96,17 +85,15 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
         files[BUILD_FILE] = _build_record(version, every_platform)
         if version == 3:
             files |= terminals(EVAPORATOR, icon=True)
-        built.append(
-            assemble(
-                EVAPORATOR,
-                version,
-                sources(version),
-                folder / name,
-                every_platform=every_platform,
-                files=files,
-                warnings=WARNINGS,
-            )
+        made = build_model(
+            EVAPORATOR,
+            folder / f"{name}.fmu",
+            version,
+            every_platform=every_platform,
+            files=files,
+            warnings=WARNINGS,
         )
+        built.append(made)
     return built
 
 
@@ -134,5 +121,5 @@ def compare_with_shipped() -> dict[str, list[str]]:
 
 def build_in_place() -> list[Path]:
     """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
-    (SOURCES / HEADER).write_bytes(sources(2)[HEADER])
+    (SOURCES / HEADER).write_bytes(sources_of(EVAPORATOR, 2)[HEADER])
     return [*build(PACKAGE, every_platform=True), *plant.build(PACKAGE, every_platform=True)]

@@ -6,11 +6,12 @@ import csv
 import hashlib
 import html
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from fractions import Fraction
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from importlib.metadata import version as version_of
 from os.path import commonprefix
 from pathlib import Path
@@ -74,10 +75,7 @@ class Variable:
 
 def read_variables(file: Path) -> list[Variable]:
     """The table of variables in a CSV file with a column for each field of `Variable`."""
-
-    def number(text: str) -> float | None:
-        return float(text) if text else None
-
+    numbers = ("start", "min", "max", "nominal")
     with file.open(encoding="utf-8", newline="") as lines:
         return [
             Variable(
@@ -85,12 +83,9 @@ def read_variables(file: Path) -> list[Variable]:
                 Kind[row["kind"]],
                 Type[row["type"]],
                 row["unit"],
-                number(row["start"]),
-                number(row["min"]),
-                number(row["max"]),
-                number(row["nominal"]),
-                row["description"],
-                tuple(row["uses"].split()),
+                **{key: float(row[key]) if row[key] else None for key in numbers},
+                description=row["description"],
+                uses=tuple(row["uses"].split()),
             )
             for row in csv.DictReader(lines)
         ]
@@ -106,13 +101,13 @@ class Unit:
     name: str
     factor: float = 1.0
     offset: float = 0.0
-    exponents: tuple[tuple[str, int], ...] | None = ()
+    exponents: Mapping[str, int] | None = field(default_factory=dict)
 
     def si(self) -> dict[str, object]:
         """The attributes of FMI's BaseUnit."""
         factor = self.factor if self.factor != 1.0 else None
         offset = self.offset if self.offset != 0.0 else None
-        return {**dict(self.exponents or ()), "factor": factor, "offset": offset}
+        return {**(self.exponents or {}), "factor": factor, "offset": offset}
 
 
 _TABLE = (Path(__file__).parent / "resources" / "units.csv").read_text(encoding="utf-8")
@@ -142,13 +137,14 @@ def unit(name: str) -> Unit:
             for base, exponent in re.findall(r"([A-Za-z]+)(-?\d+)", _SIMPLE[found[1]]["exponents"]):
                 powers[base] += power * int(exponent)
     offset = Fraction(_SIMPLE[name]["offset"] if name in _SIMPLE else 0)
-    exponents = tuple((base, power) for base, power in powers.items() if power)
-    return Unit(name, float(factor), float(offset), exponents)
+    return Unit(
+        name, float(factor), float(offset), {b: power for b, power in powers.items() if power}
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class FmuModel:
-    """A model: its name, C identifier, table of variables with their units, and interfaces.
+    """A model: its name, C identifier, table of variables, interfaces and C sources.
 
     A variable's value reference is its position in the table. `step_size` [s] is that of the
     default experiment, of 100 steps; `model_exchange` and `derivatives` (directional, in FMI 3.0
@@ -157,20 +153,24 @@ class FmuModel:
     over a sample.
     Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
     variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
-    names. `sources` are C headers of its own, by file name.
+    names. `units` gives the order of the variables' units where it shall not be the table's own.
+    `sources` are its own C headers by file name; a sampled model's ``core.h`` defines the functions
+    that ``sampled_sources/model_state.h`` lists, with arrays in the order of the table. `origin`
+    tells in generated C where it comes from.
     """
 
     name: str
     identifier: str
     description: str
     variables: tuple[Variable, ...]
-    units: tuple[Unit, ...]
     step_size: float
     model_exchange: bool = False
     derivatives: bool = False
     sampled: bool = False
     terminal: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
     sources: Mapping[str, bytes] = field(default_factory=dict)
+    origin: str = ""
 
     @cached_property
     def arrays(self) -> dict[str, list[Variable]]:
@@ -309,6 +309,10 @@ def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
         # The shipped files stay the same from one version to the next.
         tool=f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
         types={variable.type.name for variable in model.variables},
+        units=[
+            unit(name)
+            for name in model.units or dict.fromkeys(v.unit for v in model.variables if v.unit)
+        ],
         variables=[
             (_common_attributes(variable, model), *_type(version, variable, model))
             for variable in model.exported(version)
@@ -412,29 +416,32 @@ def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, lis
     ]
 
 
-def c_header(token: str, identifier: str, variables: Sequence[Variable], origin: str) -> str:
+def c_header(token: str, model: FmuModel) -> str:
     """The header's text: value references, types, starts and ranges, and the model's `token`.
+
+    The C of a sampled model checks every variable against a range.
 
     With it FMI's functions are called ``identifier_fmi2…`` and so on, so that several models link
     into one program; whoever builds a library defines FMI2_ or FMI3_OVERRIDE_FUNCTION_PREFIX.
     """
-    names = "\n".join(variable.name for variable in variables)
+    names = "\n".join(variable.name for variable in model.variables)
     return render(
         "variables.h",
         token=token,
-        identifier=identifier,
-        variables=variables,
-        origin=origin,
+        model=model,
+        origin=model.origin or f"the table of {model.name}",
         layout=hashlib.sha256(names.encode()).hexdigest()[:16],
         types=list(Type.__members__),
         kinds=list(Kind.__members__),
-        numbers=_numbers,
+        numbers=partial(_numbers, sys.float_info.max if model.sampled else 0.0),
     )
 
 
-def _numbers(variable: Variable) -> tuple[float, ...]:
-    """Start, range and nominal value as the C has them."""
-    seed = variable.type in (Type.SEED, Type.SEED_HIGH)
-    low, high = (0.0, 2.0**32 - 1) if seed else (variable.min, variable.max)
+def _numbers(most: float, variable: Variable) -> tuple[float, ...]:
+    """Start, range and nominal value as the C has them; without a range it is −`most` to `most`."""
+    low = -most if variable.min is None else variable.min
+    high = most if variable.max is None else variable.max
+    if variable.type in (Type.SEED, Type.SEED_HIGH):
+        low, high = 0.0, 2.0**32 - 1
     nominal = 1.0 if variable.nominal is None else variable.nominal
     return tuple(float(number or 0.0) for number in (variable.start, low, high, nominal))

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 
-from fmus.build import PACKAGE, RESOURCES, SOURCES, assemble, files_of, sources_of
-from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable, read_variables, render, unit
+from fmus.build import PACKAGE, RESOURCES, SOURCES, build_model, files_of
+from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable, read_variables, render
 
 # The evaporator's sources that serve any plant; the others are its own or generated.
 _SHARED = (
@@ -99,13 +99,11 @@ def plant_model(
         start = replace(s, name=f"{s.name}_start", description=f"{s.name} at the start")
         table.append(start.variable(Kind.FIXED))
     table += [s.variable(Kind.TUNABLE) for s in parameters]
-    units = dict.fromkeys(v.unit for v in table if v.unit)
     return FmuModel(
         name=name,
         identifier=name,
         description=description,
         variables=tuple(table),
-        units=tuple(unit(name) for name in units),
         step_size=sampling_time,
         model_exchange=True,
         terminal=tuple(s.name for s in (*states, *inputs)),
@@ -136,8 +134,7 @@ def build_plant(
         states=[model.by_name[name].identifier for name in model.names(Kind.STATE)],
         drawn=[n.removesuffix("_nominal") for n in model.by_name if n.endswith("_nominal")],
     ).encode()
-    sources = sources_of(model, version, own)
-    return assemble(model, version, sources, target, every_platform=every_platform)
+    return build_model(replace(model, sources=own), target, version, every_platform=every_platform)
 
 
 PLANTS = {

@@ -199,11 +199,10 @@ def starting_parameters(
     # The level of V is that of the TD error's discount.
     chosen: float | None = getattr(configuration, "discount", None)
     discounted = configuration.value_offset == "discounted"
-    offset = problem.value_level(chosen) if discounted else None
-    if start == "tuned":
-        found = tune(problem, blocks, value_offset=offset).parameters
-    else:
-        found = Parameters.naive(problem, blocks, value_offset=offset)
+    tuned = start == "tuned"
+    found = tune(problem, blocks).parameters if tuned else Parameters.naive(problem, blocks)
+    if discounted:
+        found = found.replace({"c_lambda": problem.value_level(chosen)})
     names = [name for name in ("w_sigma", "W_sigma") if name in blocks]
     found = found.replace({name: blocks.scale[blocks.slices[name]] for name in names})
     return found if file is None else file.placed_in(found)

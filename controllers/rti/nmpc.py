@@ -44,29 +44,19 @@ class LinearisationPoint(NamedTuple):
 
 
 class Functions(SampleFunctions):
-    """The CasADi functions of a controller: a sample's, and its derivatives in θ.
-
-    Those are `controllers.sensitivities`, made when they are first asked for.
-    """
+    """The CasADi functions of a controller: a sample's, and its derivatives in θ."""
 
     @cached_property
-    def _derivatives(self) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
+    def derivatives(self) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
+        """The value's gradient and a maker of the policy's derivatives, on first use."""
         exact = isinstance(self.hessian, Exact)
         return sensitivities(self.problem, self.blocks, exact=exact)
 
     @property
-    def gradient(self) -> StackedFunction:
-        """The gradient of the value."""
-        return self._derivatives[0]
-
-    def policy(self) -> StackedFunction:
-        """The derivatives of the policy."""
-        return self._derivatives[1]()
-
-    @property
     def named(self) -> dict[str, StackedFunction]:
         """The functions by the prefix of their constants in C."""
-        return super().named | {"GRADIENT": self.gradient, "POLICY": self.policy()}
+        gradient, make_policy = self.derivatives
+        return super().named | {"GRADIENT": gradient, "POLICY": make_policy()}
 
     def condense(self, before: Vector, after: Vector) -> None:
         """Write the condensed QP into copies of both memories."""
@@ -95,7 +85,7 @@ class Prepared:
 
     def part(self, name: str) -> Vector:
         """An input, result or other part of the preparation's memory, flat."""
-        return self.memory[self.functions.preparation.places[name]]
+        return self.functions.preparation.part(name, self.memory).reshape(-1)
 
     @cached_property
     def point(self) -> LinearisationPoint:
@@ -126,16 +116,13 @@ class RtiSolution:
     enforced: bool = False
     status: str = "solved"
 
-    def _flat(self, name: str) -> Vector:
-        return self.memory[self.prepared.functions.readout.places[name]]
-
     def _part(self, name: str) -> Matrix:
         return self.prepared.functions.readout.part(name, self.memory)
 
     @cached_property
     def multipliers(self) -> QpSolution:
         """Primal-dual solution of the condensed QP."""
-        return QpSolution(*(self._flat(name) for name in ("v", "nu", "lam")))
+        return QpSolution(*(self._part(name) for name in ("v", "nu", "lam")))
 
     @cached_property
     def qp(self) -> SoftQp:
@@ -188,13 +175,13 @@ class RtiSolution:
     def residual(self) -> float:
         """Largest KKT residual; compiled code has measured it when it solved."""
         if self.prepared.engine is not None and not self.enforced:
-            return float(self._flat("residual")[0])
+            return float(self._part("residual")[0])
         return self.multipliers.residual(self.qp)
 
     @property
     def iterations(self) -> int | None:
         """Steps of the compiled QP solver; None where another one solved."""
-        return None if self.prepared.engine is None else int(self._flat("iterations")[0])
+        return None if self.prepared.engine is None else int(self._part("iterations")[0])
 
     @cached_property
     def weakly_active(self) -> bool:
@@ -215,8 +202,8 @@ class RtiSolution:
     def value_gradient(self) -> Vector:
         """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
         if self.prepared.engine is not None:
-            return self._flat("gradient")
-        function = self.prepared.functions.gradient
+            return self._part("gradient")
+        function, _ = self.prepared.functions.derivatives
         self._write_solution(function)
         function()
         return function.stack.copy()
@@ -244,7 +231,7 @@ class RtiSolution:
             if found is not None:
                 return found
         dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
-        function = prepared.functions.policy()
+        function = prepared.functions.derivatives[1]()
         self._write_solution(function)
         inputs = function.inputs
         for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
@@ -260,7 +247,7 @@ class RtiSolution:
     def _write_solution(self, function: StackedFunction) -> None:
         inputs, prepared = function.inputs, self.prepared
         for name in SOLUTION:
-            inputs[name][:] = self._flat(name)
+            inputs[name][:] = self._part(name).reshape(-1)
         for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
         if "M" in inputs:
@@ -290,24 +277,21 @@ class Engine:
     def __init__(self, path: str, functions: Functions, stagewise: bool) -> None:
         self.stagewise = stagewise
         self._library = library_ = ctypes.CDLL(path)
-        before, after = functions.preparation.memory, functions.readout.memory
+        before, after = self._memory = functions.preparation.memory, functions.readout.memory
         library_.engine_sizes.restype = library_.engine_loop_size.restype = ctypes.c_size_t
         library_.engine_run.restype = ctypes.c_longlong
         sizes = [library_.engine_sizes(kind) for kind in range(3)]
         assert sizes[:2] == [before.nbytes, after.nbytes], "Python and C lay memory out unlike"
-        self._work, self._other_work = np.zeros((2, sizes[2] // 8 + 1))
-        self._loop = np.zeros(library_.engine_loop_size() // 8 + 1)
+        work, other = np.zeros((2, sizes[2] // 8 + 1))
+        loop = np.zeros(library_.engine_loop_size() // 8 + 1)
         self.action: Vector = np.zeros(functions.problem.n_actions)
-        kept = (before, self._work, self._other_work, after, self.action, self._loop)
-        self._memory = before, after
-        self._before, self._workspace, self._other, self._after, action, self._begun = (
-            ctypes.c_void_p(array.ctypes.data) for array in kept
+        # These pointers keep their arrays.
+        at_before, at_work, at_after, action, self._other, self._loop = (
+            array.ctypes.data_as(ctypes.c_void_p)
+            for array in (before, work, after, self.action, other, loop)
         )
-        self._value = (self._before, self._workspace, self._after, None)
-        self._action_value = (self._before, self._workspace, self._after, action)
-        self._prepare: Callable[..., int] = library_.engine_prepare
-        self._feedback: Callable[..., int] = library_.engine_feedback
-        self._policy: Callable[..., int] = library_.engine_policy
+        self._value = (at_before, at_work, at_after, None)
+        self._action_value = (at_before, at_work, at_after, action)
         self._sizes = self.action.size, functions.blocks.size, functions.problem.n_states
 
     @classmethod
@@ -328,11 +312,12 @@ class Engine:
 
     def prepare(self) -> int:
         """Preparation phase at the point and θ that the memory holds."""
-        return self._prepare(self._before, self._workspace)
+        return int(self._library.engine_prepare(*self._value[:2]))
 
     def feedback(self, enforced: bool) -> int:
         """Feedback phase for the memory's state, with `action` enforced or not."""
-        return self._feedback(*(self._action_value if enforced else self._value))
+        given = self._action_value if enforced else self._value
+        return int(self._library.engine_feedback(*given))
 
     def batch(self, *arrays: Vector | None) -> NDArray[np.intc]:
         """Run `engine_batch` on its arrays; statuses of the QPs (K,), −1: derivatives by Python."""
@@ -350,13 +335,14 @@ class Engine:
         found: Vector = np.empty(m * (n_theta + n))
         at, of, to = (ctypes.c_void_p(array.ctypes.data) for array in (before, after, found))
         # Use another workspace: the next feedback needs the preparation's factors.
-        if self._policy(at, of, self._other, to):
+        if self._library.engine_policy(at, of, self._other, to):
             return None
         return found[: m * n_theta].reshape(m, n_theta), found[m * n_theta :].reshape(m, n)
 
     def begin(self) -> None:
         """Make ready for a closed loop: no earlier sample is known."""
-        self._library.engine_begin(self._begun, self._before, self._after, self._workspace)
+        before, work, after, _ = self._value
+        self._library.engine_begin(self._loop, before, after, work)
 
     def run(self, plant: Any, first: int, table: Vector) -> tuple[int, int, int]:
         """Run the plant, an instance's `native`, from sample `first` on; a row of `table` each.
@@ -366,7 +352,7 @@ class Engine:
         """
         fault = (ctypes.c_int * 2)()
         reached = self._library.engine_run(
-            self._begun,
+            self._loop,
             ctypes.byref(plant),
             ctypes.c_longlong(first),
             ctypes.c_longlong(first + len(table)),
@@ -418,23 +404,24 @@ class RtiNmpc:
         self.iterations = iterations
         self.problem = problem
         self._compilable = hessian == "gauss-newton" and backend == "daqp"
-        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        horizon, m = problem.horizon, problem.n_actions
         self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
         self._functions = made = Functions(problem, parameters.blocks, hessian)
         self._prepare, self._embed = made.preparation, made.embedding
         self._readout, self._hessian = made.readout, made.hessian
         before, after = self._prepare.memory, self._readout.memory
         self._qp = made.qp(before, after)
-        self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
-        self._qp.upper[:] = np.tile(problem.action_upper - problem.reference_action, horizon)
+        self._bounds = (
+            problem.action_lower - problem.reference_action,
+            problem.action_upper - problem.reference_action,
+        )
+        self._qp.lower[:], self._qp.upper[:] = np.tile(self._bounds, horizon)
         self._engine: Engine | None = None
         self._prepared: Prepared | None = None
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)
-        self._first_lower, self._first_upper = self._qp.lower[:m], self._qp.upper[:m]
-        self._action_lower, self._action_upper = self._first_lower.copy(), self._first_upper.copy()
-        self._x = self._prepare.inputs["x"].reshape(horizon, n)
-        self._u = self._prepare.inputs["u"].reshape(horizon, m)
-        self._costates = before[self._prepare.places["costates"]].reshape(horizon, n)
+        self._x, self._u, self._costates = (
+            made.preparation.part(name).reshape(horizon, -1) for name in LinearisationPoint._fields
+        )
         # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
         places = self._prepare.places
         self._point = before[places["x"].start : places["u"].stop]
@@ -550,9 +537,8 @@ class RtiNmpc:
         """Give the slack of the predicted stages its weights (n,), discounted."""
         problem, stages = self.problem, np.arange(1, self.problem.horizon + 1)
         discounts = np.repeat(problem.discount**stages, problem.reference_state.size)
-        memory, places = self._prepare.memory, self._prepare.places
         # Make new views: a backend recognises new weights by them.
-        self._qp.w, self._qp.W = memory[places["w"]], memory[places["W"]]
+        self._qp.w, self._qp.W = self._prepare.part("w"), self._prepare.part("W")
         self._qp.w[:] = discounts * np.tile(w, stages.size)
         self._qp.W[:] = discounts * np.tile(W, stages.size)
 
@@ -563,8 +549,8 @@ class RtiNmpc:
             self._status = self._engine.prepare()
             finite = self._status != NOT_FINITE
         else:
-            constant = self._hessian.fill(self._x, self._u, self._costates)
-            prepare.memory[prepare.places["constant"]] = constant
+            # The constant of the stage costs is last.
+            prepare.memory[-1] = self._hessian.fill(self._x, self._u, self._costates)
             prepare()
             finite = prepare.finite()
         if not finite:
@@ -654,20 +640,16 @@ class RtiNmpc:
         return status == 0
 
     def _solve_interpreted(self, s: Vector, a: Vector | None) -> bool:
-        qp, read = self._qp, self._readout
+        qp, read, m = self._qp, self._readout, self._bounds[0].size
         self._embed()
-        known = self._embed.finite()
+        qp.lower[:m], qp.upper[:m] = self._bounds
         if a is not None:
-            enforced = a - self.problem.reference_action
-            self._first_lower[:] = self._first_upper[:] = enforced
-            known = known and all(map(isfinite, enforced.tolist()))
-        else:
-            self._first_lower[:], self._first_upper[:] = self._action_lower, self._action_upper
-        if not known:
+            qp.lower[:m] = qp.upper[:m] = a - self.problem.reference_action
+        if not self._embed.finite() or not (a is None or all(map(isfinite, a.tolist()))):
             return False
         found = self._backend.solve(qp)
         if a is not None:
-            found = multipliers_at_kink(qp, found, self._action_lower, self._action_upper)
+            found = multipliers_at_kink(qp, found, *self._bounds)
         inputs = read.inputs
         inputs["constant"][0] = self._prepare.memory[-1]
         inputs["v"][:], inputs["lam"][:] = found.v, found.lam

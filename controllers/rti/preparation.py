@@ -14,7 +14,7 @@ from controllers.functions import StackedFunction
 from controllers.model import runge_kutta
 from controllers.problem import Problem
 from controllers.qp import SoftQp
-from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
+from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
 from cosim.protocols import Vector
 from cosim.validation import instead
 
@@ -55,11 +55,11 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     n = problem.n_states
     x, u, symbols = _point(problem, blocks)
     x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
-    x_next, jacobian = sampled_jacobian(problem, x, u, symbols.model_parameters)
+    x_next, jacobian = sampled_jacobian(problem, x, u, symbols["model_parameters"])
     a, b = jacobian[:, :n], jacobian[:, n:]
     offset = x_next - x_s - a @ (x - x_s) - b @ (u - u_s) + symbols["c_f"]
     return stage_function(
-        "linearise", {"x": x, "u": u, "theta": symbols.theta}, {"A": a.T, "B": b.T, "r": offset}
+        "linearise", {"x": x, "u": u, "theta": symbols["theta"]}, {"A": a.T, "B": b.T, "r": offset}
     )
 
 
@@ -75,15 +75,15 @@ def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bo
     n, m = problem.n_states, problem.n_actions
     x, u, symbols = _point(problem, blocks)
     w, chi = ca.SX.sym("w", n + m), ca.SX.sym("chi", n)
-    x_next, _ = sampled_jacobian(problem, x, u, symbols.model_parameters)
+    x_next, _ = sampled_jacobian(problem, x, u, symbols["model_parameters"])
     point = ca.vertcat(x, u)
     part = ca.dot(chi, x_next + ca.jtimes(x_next, point, w - point))
-    arguments = {"x": x, "u": u, "theta": symbols.theta, "w": w, "chi": chi}
+    arguments = {"x": x, "u": u, "theta": symbols["theta"], "w": w, "chi": chi}
     if exact:
         M, guess = ca.SX.sym("M", n + m, n + m), ca.SX.sym("guess", n)
         part += ca.dot(M, _curvature(problem, symbols, x, u, guess))
         arguments |= {"M": M, "guess": guess}
-    gradient = ca.gradient(part, symbols.theta)[blocks.slices["p"]]
+    gradient = ca.gradient(part, symbols["theta"])[blocks.slices["p"]]
     return stage_function("parameter_gradient", arguments, {"gradient": gradient})
 
 
@@ -101,13 +101,13 @@ def stage_function(
     )
 
 
-def _point(problem: Problem, blocks: ThetaBlocks) -> tuple[ca.SX, ca.SX, SymbolicTheta]:
+def _point(problem: Problem, blocks: ThetaBlocks) -> tuple[ca.SX, ca.SX, Symbols]:
     x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
-    return x, u, SymbolicTheta.of(problem, blocks)
+    return x, u, symbolic_theta(problem, blocks)
 
 
-def _curvature(problem: Problem, symbols: SymbolicTheta, x: ca.SX, u: ca.SX, chi: ca.SX) -> ca.SX:
-    x_next, _ = sampled_jacobian(problem, x, u, symbols.model_parameters)
+def _curvature(problem: Problem, symbols: Symbols, x: ca.SX, u: ca.SX, chi: ca.SX) -> ca.SX:
+    x_next, _ = sampled_jacobian(problem, x, u, symbols["model_parameters"])
     hessian, _ = ca.hessian(ca.dot(chi, x_next), ca.vertcat(x, u))
     return hessian
 
@@ -244,7 +244,7 @@ def embedding(
     rows Γ V must respect.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    symbols = SymbolicTheta.of(problem, blocks)
+    symbols = symbolic_theta(problem, blocks)
     s = ca.SX.sym("s", n)
     x_s = ca.DM(problem.reference_state)
     prior = {
@@ -258,9 +258,9 @@ def embedding(
     upper = ca.repmat(symbols["x_u"] - x_s, horizon, 1) - free
     return StackedFunction(
         "embedding",
-        {"s": s, "theta": symbols.theta, **prior},
+        {"s": s, "theta": symbols["theta"], **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
-        {name: prepared.memory[prepared.places[name]] for name in prior}
+        {name: prepared.part(name).reshape(-1) for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
@@ -279,7 +279,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     compiled code gives, `residual` and `iterations` of the QP's solver and the gradient (n_θ,).
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    symbols = SymbolicTheta.of(problem, blocks)
+    symbols = symbolic_theta(problem, blocks)
     x_s = ca.DM(problem.reference_state)
     shapes = {
         "s": (n, 1),
@@ -328,7 +328,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     u_s = ca.DM(problem.reference_action)
     return StackedFunction(
         "readout",
-        {**given, "theta": symbols.theta},
+        {**given, "theta": symbols["theta"]},
         {
             "xi": ca.horzcat(*xi),
             "t": ca.horzcat(*t),
@@ -339,7 +339,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
         {
-            name: prepared.memory[prepared.places[name]]
+            name: prepared.part(name).reshape(-1)
             for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
         },
         room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
@@ -432,7 +432,7 @@ class Exact(GaussNewton):
         chi = ca.SX.sym("chi", n)
         stage = stage_function(
             "curvature_of_stage",
-            {"x": x, "u": u, "chi": chi, "theta": symbols.theta},
+            {"x": x, "u": u, "chi": chi, "theta": symbols["theta"]},
             {"D": _curvature(problem, symbols, x, u, chi)},
         )
         given = {
@@ -507,13 +507,9 @@ class SampleFunctions:
 
     def qp(self, before: Vector, after: Vector) -> SoftQp:
         """The QP in the memory of preparation and read-out, `before` and `after`, or copies."""
-        prepared, read = self.preparation.places, self.readout.places
+        vectors = ("f", "lower", "upper", "row_lower", "row_upper")
         return SoftQp(
-            H=self.preparation.part("H", before),
             rows=self.preparation.part("Gamma", before),
-            **{name: before[prepared[name]] for name in ("w", "W")},
-            **{
-                name: after[read[name]]
-                for name in ("f", "lower", "upper", "row_lower", "row_upper")
-            },
+            **{name: self.preparation.part(name, before) for name in ("H", "w", "W")},
+            **{name: self.readout.part(name, after) for name in vectors},
         )

@@ -19,7 +19,7 @@ from cosim.plant.fmu_plant import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
-from fmus.build import build_sampled, sampled_system
+from fmus.build import build_model, sampled_table
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
 from fmus.ssp import write_ssp
 
@@ -99,15 +99,16 @@ def sampled_controller(
         Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
         for (label, value), about in zip(theta.items(), meanings, strict=True)
     ]
-    return sampled_system(
+    return FmuModel(
         name=f"RTI-NMPC {scenario.name}",
         identifier=f"rti_nmpc_{hashlib.sha256(origin.encode()).hexdigest()[:12]}",
         description=(
             f"Real-time-iteration NMPC for {scenario.name}: horizon {problem.horizon}, "
             f"{hessian} Hessian, θ {parameters.hash}"
         ),
-        sampling_time=scenario.sampling_time,
-        signals=signals,
+        variables=sampled_table(signals),
+        step_size=scenario.sampling_time,
+        sampled=True,
         sources=exported.sources,
         terminal=(*states, *actions),
     )
@@ -153,7 +154,7 @@ def write_fmu(
         "theta_hash": controller.parameters.hash,
     }
     document = (json.dumps(record, indent=2, default=repr) + "\n").encode()
-    return build_sampled(
+    return build_model(
         system, target, version, every_platform=every_platform, files={RECORD: document}
     )
 

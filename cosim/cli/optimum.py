@@ -48,8 +48,9 @@ def optimum(
 
 
 def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cli.Output) -> None:
-    names = [name for name, value in policy.law.plants[0].items() if value is not None]
-    table = [{name: plant[name] for name in names} | {"J": gain} for plant, gain in policy.gains]
+    names = list(policy.law.parameters)
+    values = zip(*policy.law.parameters.values(), policy.gains, strict=True)
+    table = [dict(zip((*names, "J"), row, strict=True)) for row in values]
     rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
     rows.append(("mean", *[""] * (len(names) - 1), f"{policy.gain:.4f}"))
     title = f"quasi-static reference of {task.name}: a reference, not a bound"
@@ -123,28 +124,31 @@ def tuning(
         out: Write the tuned θ to this TOML file.
     """
     with cli.output(json) as out_:
+        import numpy as np
+
         from controllers.economic import tune
         from controllers.factories import value_offset
         from controllers.problem import Problem
 
         task = cli.load_scenario(scenario)
         problem = Problem.from_scenario(task)
-        result = tune(problem, value_offset=value_offset(task, problem))
+        result = tune(problem)
+        parameters = result.parameters.replace({"c_lambda": value_offset(task, problem)})
         steady, convex = result.steady_state, result.convexification
         rows = [tuple(line.split("  ", 1)) for line in str(result).splitlines()]
         out_.table(f"economic tuning of {scenario}", ("", "certificate"), rows)
         if out is not None:
-            result.parameters.save(out)
-            out_.note(f"θ {result.parameters.hash} is in {out.resolve()}")
+            parameters.save(out)
+            out_.note(f"θ {parameters.hash} is in {out.resolve()}")
         states, actions = steady.x.tolist(), steady.u.tolist()
         prices = (steady.C @ steady.multipliers).tolist()
         document = {
             "scenario": scenario,
             "steady_state": {"states": states, "actions": actions, "cost": steady.cost},
             "active": dict(zip(steady.active, prices, strict=True)),
-            "economic_eigenvalues": steady.eigenvalues.tolist(),
-            "convexified_eigenvalues": convex.eigenvalues.tolist(),
+            "economic_eigenvalues": np.linalg.eigvalsh(steady.hessian).tolist(),
+            "convexified_eigenvalues": np.linalg.eigvalsh(convex.hessian).tolist(),
             "gain_error": result.gain_error,
-            "parameters": result.parameters.hash,
+            "parameters": parameters.hash,
         }
         out_.json(document)

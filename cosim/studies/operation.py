@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from time import process_time
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from scipy.stats import ttest_1samp
 
 from controllers import compile_functions
 from controllers.factories import nmpc
-from controllers.optimum import Fouling, QuasiStaticPolicy
+from controllers.optimum import QuasiStaticPolicy, fouling
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
@@ -36,31 +37,23 @@ LIFE = [
 
 def plant_at(scenario: Scenario, time: float) -> Scenario:
     """The scenario with its plant frozen at a time in s."""
-    if law := Fouling.from_scenario(scenario):
+    if fouled := fouling(scenario):
+        name, value = fouled
         return scenario.replace(
-            {"plant": {"parameters": law.present(time) | {"fouling_rate": 0.0}}}
+            {"plant": {"parameters": {name: float(value(time)), "fouling_rate": 0.0}}}
         )
     return scenario.at(time)
 
 
-class StoppedPolicy(QuasiStaticPolicy):
-    """The reference of a plant that fouls, its clock stopped at a `sample`."""
-
-    sample = 0
-
-    def prepare(self) -> None:
-        """Leave the clock where it stopped."""
-        self._sample = self.sample
-
-
 def optimum_at(scenario: Scenario, sample: int) -> Controller:
     """The optimal policy of the plant frozen at a sample."""
-    if Fouling.from_scenario(scenario) is None:
-        return build_controller("optimal", plant_at(scenario, sample * scenario.sampling_time))
+    time = sample * scenario.sampling_time
+    if fouling(scenario) is None:
+        return build_controller("optimal", plant_at(scenario, time))
     moving = QuasiStaticPolicy.from_scenario(scenario)
-    found = StoppedPolicy(moving.law, moving.policies, scenario.sampling_time)
-    found.sample = sample
-    return found
+    where = moving.law.position(time)
+    law = replace(moving.law, position=lambda _: where)
+    return QuasiStaticPolicy(law, moving.policies, scenario.sampling_time)
 
 
 def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dict[int, float], int]:

@@ -1,12 +1,12 @@
-/* Generated {{ origin }}; do not edit. */
+/* Generated from {{ origin }}; do not edit. */
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
 #ifndef FMI2_FUNCTION_PREFIX
-#define FMI2_FUNCTION_PREFIX {{ identifier }}_
+#define FMI2_FUNCTION_PREFIX {{ model.identifier }}_
 #endif
 #ifndef FMI3_FUNCTION_PREFIX
-#define FMI3_FUNCTION_PREFIX {{ identifier }}_
+#define FMI3_FUNCTION_PREFIX {{ model.identifier }}_
 #endif
 
 #define MODEL_TOKEN "{{ token }}"
@@ -15,10 +15,10 @@
 #define LAYOUT_DIGEST UINT64_C(0x{{ layout }})
 
 enum {
-{% for variable in variables %}
+{% for variable in model.variables %}
     VR_{{ variable.identifier }} = {{ loop.index0 }},
 {% endfor %}
-    N_VARIABLES = {{ variables|length }}
+    N_VARIABLES = {{ model.variables|length }}
 };
 
 typedef enum { {{ types|join(", ") }} } VariableType;
@@ -33,7 +33,7 @@ typedef struct {
 } VariableInfo;
 
 static const VariableInfo VARIABLES[N_VARIABLES] = {
-{% for variable in variables %}
+{% for variable in model.variables %}
     {"{{ variable.name }}", {{ variable.type.name }}, {{ variable.kind.name }}, {{ numbers(variable)|join(", ") }}},
 {% endfor %}
 };

@@ -144,10 +144,6 @@ def test_plant_parameters_of_the_scenario_reach_the_model():
     plant = PlantProblem.from_scenario(scenario)
     names = [quantity.name for quantity in plant.problem.model.parameters]
     assert plant.parameters[names.index("UA2")] == 7.0
-    overridden = PlantProblem.from_scenario(scenario, {"UA2": 6.0, "Cp": None})
-    assert overridden.parameters[names.index("UA2")] == 6.0
-    left_out = PlantProblem.from_scenario(scenario, {"UA2": None})
-    np.testing.assert_array_equal(left_out.parameters, plant.problem.model.nominal_parameters)
 
 
 def leaky_evaporator():

@@ -5,7 +5,7 @@ import pytest
 
 from controllers.errors import OptimumError
 from controllers.factories import optimal
-from controllers.optimum import Fouling, QuasiStaticPolicy, change_of, stored_optimum
+from controllers.optimum import QuasiStaticPolicy, change_of, fouling, stored_optimum
 from cosim import FmuPlant, Scenario
 
 
@@ -20,7 +20,8 @@ def policy(drifting):
 
 
 def test_the_law_of_fouling_is_the_fmus(drifting):
-    fouling = Fouling.from_scenario(drifting)
+    name, value = fouling(drifting)
+    assert name == "UA2"
     seen = drifting.replace(
         {
             "sampling_time": 21600.0,
@@ -31,26 +32,26 @@ def test_the_law_of_fouling_is_the_fmus(drifting):
     with FmuPlant(seen) as plant:
         plant.reset(0)
         found = [plant.step(seen.reference_action).disturbance[0] for _ in range(60)]
-    np.testing.assert_allclose(found, fouling.heat_transfer(0.25 * np.arange(60)), rtol=1e-9)
+    np.testing.assert_allclose(found, value(21600.0 * np.arange(60)), rtol=1e-9)
     assert min(found) < 5.2
     assert max(found) > 6.8
 
 
 def test_a_condenser_that_does_not_foul_has_no_law():
-    assert Fouling.from_scenario(Scenario.load("paper")) is None
+    assert fouling(Scenario.load("paper")) is None
     still = Scenario.load("drifting").replace({"plant": {"parameters": {"fouling_floor": 1.0}}})
-    assert Fouling.from_scenario(still) is None
+    assert fouling(still) is None
     never = Scenario.load("drifting").replace({"plant": {"parameters": {"cleaning_period": 0.0}}})
     with pytest.raises(OptimumError):
-        Fouling.from_scenario(never)
+        fouling(never)
 
 
 def test_the_reference_is_the_mean_of_the_optima_along_the_cycle(policy, drifting):
-    nodes, gains = np.array([(plant["UA2"], gain) for plant, gain in policy.gains]).T
+    nodes, gains = policy.law.parameters["UA2"], np.array(policy.gains)
     assert nodes[-1] == 6.84
     assert (np.diff(gains) < 0).all()
     days = (np.arange(20_000) + 0.5) * 6.0 / 20_000
-    linear = np.interp(Fouling.from_scenario(drifting).heat_transfer(days), nodes, gains).mean()
+    linear = np.interp(fouling(drifting)[1](86400.0 * days), nodes, gains).mean()
     assert policy.gain == pytest.approx(linear, rel=1e-3)
     assert gains[-1] < policy.gain < gains[0]
 

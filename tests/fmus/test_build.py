@@ -105,7 +105,7 @@ def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
 def test_committed_header_is_not_stale() -> None:
     committed = (build.SOURCES / build.HEADER).read_bytes()
     remedy = "run `cosim fmu build --in-place` and commit what it writes"
-    assert committed == evaporator.sources(2)[build.HEADER], remedy
+    assert committed == build.sources_of(evaporator.EVAPORATOR, 2)[build.HEADER], remedy
 
 
 @pytest.mark.slow

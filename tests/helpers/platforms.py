@@ -18,8 +18,8 @@ import fmus
 from cosim import Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from fmus import PLATFORMS, Platform
-from fmus.build import HEADER, cross_compiler, sampled_sources
-from fmus.evaporator import EVAPORATOR, sources
+from fmus.build import HEADER, cross_compiler, sources_of
+from fmus.evaporator import EVAPORATOR
 from fmus.model import FmiVersion
 
 HOSTS = Path(__file__).parents[1] / "fmus" / "platforms"
@@ -123,7 +123,7 @@ class Hosted:
 def hosted_plant(version: FmiVersion, folder: Path) -> Hosted:
     """The shipped plant."""
     fmu = fmus.path(fmus.NAMES[version - 2])
-    header = sources(version)[HEADER]
+    header = sources_of(EVAPORATOR, version)[HEADER]
     importer = Importer("host.c", {HEADER: header}, folder / f"host{version}")
     return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, EVAPORATOR.identifier)
 
@@ -135,7 +135,7 @@ def hosted_controller(version: FmiVersion, folder: Path) -> Hosted:
     controller = rti_controller("tuned", scenario)
     system = sampled_controller(controller, scenario)
     fmu = write_fmu(controller, scenario, target, version, every_platform=True)
-    sources = sampled_sources(system, version)
+    sources = sources_of(system, version)
     headers = {name: sources[name] for name in ("variables.h", "system.h")}
     importer = Importer("controller_host.c", headers, folder / f"host{version}")
     return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, system.identifier)

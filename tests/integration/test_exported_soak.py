@@ -11,7 +11,7 @@ import pytest
 from controllers.factories import tuned
 from cosim import Scenario
 from cosim.cli.controller_fmu import sampled_controller
-from fmus.build import sampled_sources
+from fmus.build import sources_of
 
 SOAK = Path(__file__).parents[1] / "fmus" / "sampled" / "soak.c"
 COMPILER = os.environ.get("CC", "cc")
@@ -29,7 +29,7 @@ def test_nothing_is_allocated_or_broken_while_it_steps(tmp_path: Path, hessian: 
         pytest.skip("there is no C compiler")
     scenario = Scenario.load("paper").replace({"controller": {"hessian": hessian}})
     system = sampled_controller(tuned(scenario), scenario)
-    for name, data in sampled_sources(system, 2).items():
+    for name, data in sources_of(system, 2).items():
         (tmp_path / name).write_bytes(data)
     program, headers = tmp_path / "soak", Path(fmpy.__file__).parent / "c-code"
     folders = ["-isystem", headers, "-I", tmp_path]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controllers.economic import tune
-from controllers.optimum import Fouling
+from controllers.optimum import fouling
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
@@ -154,12 +154,12 @@ def test_identification_again_and_again_follows_a_parameter():
     )
     run = make_run("identified", scenario=scenario, configuration=configuration, start="naive")
     rows = run_training(run).rows
-    law = Fouling.from_scenario(scenario).heat_transfer
+    _, law = fouling(scenario)
     for row in rows[3::3]:
         # The fit is of the 150 samples before it, that is of their middle.
         last = row["samples"] - row["samples"] % 150
         fitted = float(row.parameters["p"][0])
-        assert fitted == pytest.approx(float(law((last - 75) / 1440)), rel=0.03)
+        assert fitted == pytest.approx(float(law(60.0 * (last - 75))), rel=0.03)
 
 
 def test_the_policy_search_hands_over_the_mean_and_improves():

@@ -51,7 +51,7 @@ class Plant:
 
 @pytest.fixture
 def start(problem):
-    return Parameters.naive(problem, value_offset=1.0)
+    return Parameters.naive(problem).replace({"c_lambda": 1.0})
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ class Bowl(Plant):
 
 @pytest.fixture
 def far(problem):
-    naive = Parameters.naive(problem, value_offset=6e5)
+    naive = Parameters.naive(problem).replace({"c_lambda": 6e5})
     return naive.replace({"x_l": naive["x_l"] + [2.5, 0.0], "b_l": [1.0, -2.0, 30.0, 4.0]})
 
 
@@ -177,7 +177,7 @@ SAMPLES = 20_000
 
 
 def search(scenario, problem, samples=SAMPLES):
-    start = Parameters.naive(problem, value_offset=6e5)
+    start = Parameters.naive(problem).replace({"c_lambda": 6e5})
     sizes = {"phase": 1000, "stretch": 100, "stretches": 8}
     return SearchPlan(scenario, start, np.array([10.0, 10.0]), samples, 7, **sizes)
 

@@ -11,7 +11,6 @@ from controllers.dynamic_programming import (
     certify,
     evaluate_policy,
     objection,
-    refine,
     simulate_policy,
     solve,
 )
@@ -83,7 +82,7 @@ def test_number_of_workers_changes_no_bit():
 
 def test_refining_a_solution_equals_solving_finely(scalar_levels):
     coarse, fine = scalar_levels
-    refined = refine(SCALAR.plant, Settings(), coarse, level=2)
+    refined = certify(SCALAR.plant, Settings(), coarse, paths=2, steps=1)
     assert refined.grid.size > 1.4 * coarse.grid.size
     assert refined.gain == pytest.approx(fine.gain, rel=1e-5)
 

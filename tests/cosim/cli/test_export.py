@@ -24,7 +24,7 @@ from controllers.theta import ThetaBlocks
 from cosim import FmuPlant, Scenario, simulate
 from cosim.cli.controller_fmu import rti_controller, sampled_controller
 from cosim.cli.main import app
-from fmus.build import build_sampled
+from fmus.build import build_model
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.instance import Instance
 
@@ -160,9 +160,7 @@ def test_theta_may_change_between_samples(tmp_path, version):
     naive_theta = Parameters.naive(problem, blocks)
     controller = nmpc(scenario, naive_theta.replace({"b_l": [0.1, 0.0, 0.2, 0.1]}))
     system = sampled_controller(controller, scenario)
-    fmpy.extract(
-        str(build_sampled(system, tmp_path / "c.fmu", version)), str(tmp_path / "unzipped")
-    )
+    fmpy.extract(str(build_model(system, tmp_path / "c.fmu", version)), str(tmp_path / "unzipped"))
     fmu = Instance(tmp_path / "unzipped", version).initialise()
     everything = {block.name: naive_theta[block.name] for block in blocks}
     names = [v.name for v in system.variables if v.name.startswith("theta.")]
@@ -203,7 +201,7 @@ def test_automatic_goes_on_from_what_the_operator_did_in_manual(tmp_path, versio
         (240.0, 25.2, 51.0, False, 230.0, 190.0),
     ]
     result = fmpy.simulate_fmu(
-        str(build_sampled(system, tmp_path / "controller.fmu", version)),
+        str(build_model(system, tmp_path / "controller.fmu", version)),
         stop_time=300.0,
         step_size=60.0,
         output_interval=60.0,
@@ -227,7 +225,7 @@ def test_a_measured_feed_spares_violations(tmp_path):
     scenario, violation = Scenario.load("paper").replace({"plant": thinner}), [0.0, 0.0]
     controller = rti_controller("tuned", scenario, ("X1",))
     system = sampled_controller(controller, scenario, ("X1",))
-    fmpy.extract(str(build_sampled(system, tmp_path / "c.fmu")), str(tmp_path / "c"))
+    fmpy.extract(str(build_model(system, tmp_path / "c.fmu")), str(tmp_path / "c"))
     for measured in (False, True):
         fmu = Instance(tmp_path / "c", 2).initialise()
         controller.reset()

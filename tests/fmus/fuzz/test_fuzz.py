@@ -9,7 +9,8 @@ import fmpy
 import pytest
 
 from fmus import plant as plants
-from fmus.evaporator import sources
+from fmus.build import sources_of
+from fmus.evaporator import EVAPORATOR
 from fmus.model import FmiVersion
 from fmus.plant import build_plant
 
@@ -31,7 +32,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.sanitised]
 def written(name: str, version: FmiVersion, folder: Path) -> Path:
     """The folder with the C sources that the FMU of a plant carries."""
     if name == "evaporator":
-        for file, data in sources(version).items():
+        for file, data in sources_of(EVAPORATOR, version).items():
             (folder / file).write_bytes(data)
         return folder
     fmu = folder / f"{name}.fmu"

@@ -7,7 +7,7 @@ import fmpy
 import pytest
 
 from fmus import BuildError
-from fmus.build import build_sampled, sampled_system
+from fmus.build import build_model, sampled_table
 from fmus.model import FmuModel, Kind, Variable
 from tests.helpers.instance import Instance
 
@@ -36,16 +36,19 @@ STEP = 2.0
 
 @pytest.fixture(scope="session")
 def adder() -> FmuModel:
-    return sampled_system(
+    return FmuModel(
         name="adder",
         identifier="adder",
         description="adds its inputs",
-        sampling_time=STEP,
-        signals=(
-            Variable("u", Kind.INPUT, unit="kPa", start=1.0, min=-10.0, max=10.0),
-            Variable("y", Kind.OUTPUT, unit="kPa"),
-            Variable("theta.gain[0]", Kind.TUNABLE, start=1.0),
+        variables=sampled_table(
+            [
+                Variable("u", Kind.INPUT, unit="kPa", start=1.0, min=-10.0, max=10.0),
+                Variable("y", Kind.OUTPUT, unit="kPa"),
+                Variable("theta.gain[0]", Kind.TUNABLE, start=1.0),
+            ]
         ),
+        step_size=STEP,
+        sampled=True,
         sources={"core.h": CORE},
     )
 
@@ -54,7 +57,7 @@ def adder() -> FmuModel:
 def built(request, adder: FmuModel, tmp_path_factory) -> tuple[int, Path]:
     folder = tmp_path_factory.mktemp("sampled")
     try:
-        return request.param, build_sampled(adder, folder / "adder.fmu", request.param)
+        return request.param, build_model(adder, folder / "adder.fmu", request.param)
     except BuildError as error:
         pytest.skip(str(error))
 

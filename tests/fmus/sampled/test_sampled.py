@@ -9,15 +9,15 @@ import fmpy
 import pytest
 from fmpy.fmi1 import FMICallException
 
-from fmus import evaporator
-from fmus.build import build_sampled, sampled_sources
+from fmus.build import build_model, sources_of
+from fmus.evaporator import EVAPORATOR
 from fmus.model import FmuModel
 
 
 def test_a_rebuild_repeats_its_bytes(
     built: tuple[int, Path], adder: FmuModel, tmp_path: Path
 ) -> None:
-    again = build_sampled(adder, tmp_path / "adder.fmu", built[0])
+    again = build_model(adder, tmp_path / "adder.fmu", built[0])
     assert again.read_bytes() == built[1].read_bytes()
 
 
@@ -39,13 +39,10 @@ def test_sources_of_two_models_link_into_one_program(
     assert FULL_NAME in text
     functions.write_text(text.replace(FULL_NAME, STANDARD))
     objects = []
-    for name, files in (
-        ("evaporator", evaporator.sources(version)),
-        ("adder", sampled_sources(adder, version)),
-    ):
+    for name, model in (("evaporator", EVAPORATOR), ("adder", adder)):
         folder = tmp_path / name
         folder.mkdir()
-        for file, data in files.items():
+        for file, data in sources_of(model, version).items():
             (folder / file).write_bytes(data)
         objects.append(folder / "model.o")
         command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-isystem", "headers", "-c"]

@@ -32,7 +32,7 @@ from controllers.theta import Parameters
 from cosim.protocols import Array
 from cosim.simulation import recover
 from learning.algorithm import Transition
-from learning.checkpoint import group, take_up
+from learning.checkpoint import State, take_up
 
 PARAMETER_DEVIATION = 0.15
 """Prior standard deviation of a parameter's error, as a share of its value."""
@@ -295,11 +295,11 @@ class PlantData:
         self.era, self._pool = self.count - len(errors), model.residuals[-POOL:]
         return True
 
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: State) -> None:
         """Take back what a checkpoint has of this."""
         take_up(self, state)
-        if model := group(state, "model "):
-            self.model = EmpiricalModel(self.features, **model)
+        if state["model"] is not None:
+            self.model = EmpiricalModel(self.features, **state["model"])
 
 
 class Rollout:

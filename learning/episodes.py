@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-import numpy as np
 from numpy.typing import NDArray
 
 from cosim.protocols import Vector
 from learning.algorithm import Algorithm, Transition, Update
-from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.checkpoint import State, arrays_of, take_up
 from learning.step import moved
 
 Told = dict[str, NDArray[Any]]
@@ -108,21 +107,17 @@ class Planned(Algorithm):
         """Take a sample at which the controller failed, with its share of J."""
         return self.observe(None, cost)
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> State:
         """What the plan was told, the open episode, and `KEPT`."""
-        state = super().state() | {"told": np.array(len(self._history))}
-        for number, told in enumerate(self._history):
-            state |= prefixed(f"told {number} ", told)
-        if self._episode is not None:
-            state |= prefixed("episode ", arrays_of(self._episode))
-        return state
+        state = super().state() | {"told": self._history}
+        return state | {"episode": None if self._episode is None else arrays_of(self._episode)}
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+    def restore(self, state: State) -> None:
         """Restore what `state` returned."""
         theta = self.controller.theta
-        for number in range(int(state["told"])):
-            self._tell(group(state, f"told {number} "))
+        for told in state["told"]:
+            self._tell(told)
         self.controller.theta = theta
         if self._episode is not None:
-            take_up(self._episode, group(state, "episode "))
+            take_up(self._episode, state["episode"])
         super().restore(state)

@@ -662,8 +662,8 @@ class _Session:
             return
         state |= {
             "plant": np.frombuffer(plant, dtype=np.uint8),
-            "rows": np.array([list(row.values()) for row in self.rows]),
-            "row_thetas": np.array([row.parameters.theta for row in self.rows]),
+            "rows": [[*row.values()] for row in self.rows],
+            "row_thetas": [row.parameters.theta for row in self.rows],
         }
         checkpoint.save(self.out / CHECKPOINT, self.identity, state)
 
@@ -672,10 +672,9 @@ class _Session:
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
         state = checkpoint.load(self.out / CHECKPOINT, self.identity)
-        rows = zip(state["rows"].tolist(), state["row_thetas"], strict=True)
         self.rows = [
             LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
-            for figures, theta in rows
+            for figures, theta in zip(state["rows"], state["row_thetas"], strict=True)
         ]
         self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
         self.loop.restore(state)

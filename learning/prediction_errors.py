@@ -27,7 +27,7 @@ class OneStepModel:
 
     def __init__(self, scenario: Scenario) -> None:
         problem = Problem.from_scenario(scenario)
-        self.states = problem.n_states
+        self.states, self.inputs = problem.n_states, problem.n_states + problem.n_actions
         model = problem.model
         step = discretise(model, problem.sampling_time, problem.substeps)
         x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)

@@ -58,34 +58,13 @@ class Trial(Episode):
     """θ (n_θ,) runs greedily for a stretch, or is where the rule `learns` from.
 
     The rule goes on with its data, or with a `width` begins anew, its prior or trust region so many
-    times as wide. With the exploration's σ as `deviation` (m,) a stretch tells dπ/dθ too.
+    times as wide. What a stretch may `measure` is dπ/dθ, in the exploration's σ, (m, n_θ).
     """
 
-    KEPT = (*Episode.KEPT, "rows", "candidates", "stage_cost", "penalty", "metric", "jacobians")
+    KEPT = (*Episode.KEPT, "candidates")
     learns: bool = False
     width: float | None = None
-    deviation: Vector | None = None
-
-    def __post_init__(self) -> None:
-        self.rows: list[Vector] = []
-        self.candidates: list[Vector] = []
-        self.stage_cost, self.penalty, self.jacobians = 0.0, 0.0, 0
-        self.metric: Matrix = np.zeros((0 if self.deviation is None else self.theta.size,) * 2)
-
-    def take(self, transition: Transition | None, cost: float) -> bool:
-        """Take a sample; one at which the controller failed has its share of J alone."""
-        if transition is None:
-            self.stage_cost += cost
-            return super().take(transition, cost)
-        self.rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
-        self.stage_cost += transition.stage_cost
-        self.penalty += transition.next_penalty
-        if self.deviation is not None and self.done % max(self.length // SENSITIVITIES, 1) == 0:
-            jacobian = transition.policy.policy_jacobian / self.deviation[:, None]
-            if np.isfinite(jacobian).all():
-                self.metric += jacobian.T @ jacobian
-                self.jacobians += 1
-        return super().take(transition, cost)
+    candidates: list[Vector] = field(default_factory=list, init=False)
 
     def predicted(self, model: OneStepModel) -> Told:
         """What the trial told, with predictions by the controller's own `model`.
@@ -95,21 +74,25 @@ class Trial(Episode):
         of stage cost and penalty per sample (2,), its `predictions` f(s, a) (K, n), and `metric`
         E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ), with Σ = diag σ².
         """
-        n = model.states
-        kept = self.rows[-LATEST:] if self.learns else self.rows
-        rows = np.array(kept) if kept else np.zeros((0, 2 * n))
-        predictions = np.array([model(row[:n], row[n:-n]) for row in rows]).reshape(-1, n)
-        states, errors = rows[:, :n], rows[:, -n:] - predictions
+        n, rows = model.states, self.samples(3 + model.inputs + model.states)
+        costs, rows = np.array(self.costs), rows[-LATEST:] if self.learns else rows
+        predictions = np.array([model(row[3 : 3 + n], row[3 + n : -n]) for row in rows])
+        predictions = predictions.reshape(-1, n)
+        states, errors = rows[:, 3 : 3 + n], rows[:, -n:] - predictions
         if self.learns:
-            if not kept:
+            if not len(rows):
                 states, errors = np.zeros((2, 1, n))
-            candidates = np.array(self.candidates).reshape(-1, self.theta.size)
             deviations = np.array([states.std(axis=0), errors.std(axis=0)])
-            return {"errors": errors, "candidates": candidates, "deviations": deviations}
-        told = {"cost": np.array([self.stage_cost, self.penalty]) / self.length}
+            return {"errors": errors, "candidates": self.candidates, "deviations": deviations}
+        # A sample at which the controller failed has its share of J alone.
+        costs[rows[:, 0].astype(int)] = rows[:, 1]
+        total = costs.cumsum()[-1], np.append(0.0, rows[:, 2]).cumsum()[-1]
+        told = {"cost": np.array(total) / self.length}
         told |= {"errors": errors, "predictions": predictions}
-        if self.deviation is not None:
-            told["metric"] = self.metric / max(self.jacobians, 1)
+        if self.measure is not None:
+            jacobians = [J for J in map(np.array, self.measured) if np.isfinite(J).all()]
+            metric = sum((J.T @ J for J in jacobians), np.zeros((self.theta.size,) * 2))
+            told["metric"] = metric / max(len(jacobians), 1)
         return told
 
 
@@ -308,8 +291,13 @@ class SearchPlan:
 
     def _directions(self, *, turned: bool) -> Generator[Trial, None, Matrix]:
         """Directions in scaled θ that change the policy by the exploration's σ, (n_θ, K)."""
-        deviation = self._action_deviation
-        trial = Trial(self.base.theta, self.stretch, rewind=True, deviation=deviation)
+
+        def sensitivity(transition: Transition, number: int) -> Matrix | None:
+            if number % max(self.stretch // SENSITIVITIES, 1):
+                return None
+            return transition.policy.policy_jacobian / self._action_deviation[:, None]
+
+        trial = Trial(self.base.theta, self.stretch, rewind=True, measure=sensitivity)
         told, _, _ = yield from self._ask(trial)
         values, vectors = np.linalg.eigh(told["metric"] * np.outer(self._scale, self._scale))
         values, vectors = values[::-1][: self.DIRECTIONS], vectors[:, ::-1][:, : self.DIRECTIONS]
@@ -577,9 +565,9 @@ class Search(Planned):
                 # A new rule counts from 0: its schedules begin anew.
                 update = self._rule.observe(transition._replace(number=self._learnt))
                 self._learnt += 1
-                if (trial.done + 1) % max(trial.length // CANDIDATES, 1) == 0:
+                if (len(trial.costs) + 1) % max(trial.length // CANDIDATES, 1) == 0:
                     trial.candidates.append(self.controller.theta.copy())
             except DivergenceError:
                 # The phase ends here; its earlier candidates may still be good.
-                trial.length = trial.done + 1
+                trial.length = len(trial.costs) + 1
         return super().observe(transition, cost) or update

@@ -67,7 +67,7 @@ class Dyna(QLearning):
         changed = data.model is not None and since % WINDOWS[0] == 0 and self._changed()
         age = data.count - data.era
         if changed:
-            self._count = 0
+            self._count, self._first = 0, []
             self._average_cost.mean_cost = self.scenario.controller.reference_cost
         if since < max(self.configuration.interval, age // GROWTH) and not changed:
             return update

@@ -26,7 +26,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import Configuration, Count
 from learning.episodes import Episode, Planned, Told
 from learning.errors import ConfigurationError, DivergenceError
-from learning.prediction_errors import OneStepModel, known_penalty
+from learning.prediction_errors import OneStepModel, PredictionErrors, known_penalty
 from learning.step import moved
 
 BackOffToo = Annotated[bool, Field(description="search the back-off of the active bounds")]
@@ -375,33 +375,31 @@ class OffsetFree(Estimate):
     """
 
     Configuration = OffsetFreeConfiguration
-    KEPT = (*Estimate.KEPT, "_offset", "_seen", "_errors")
+    KEPT = (*Estimate.KEPT, "_offset", "_errors")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
         self._parameters = self._model.parameters(self._start)
         self._offset = self._start["c_f"]
-        self._errors = np.zeros((self.configuration.memory, len(self._offset)))
-        self._seen = 0
+        self._errors = PredictionErrors(self.scenario, self.configuration.memory)
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Filter the error of one prediction."""
         predicted = self._model.predict(transition.s, transition.a, self._parameters)[0]
         error = transition.next_s - predicted
-        self._errors[self._seen % len(self._errors)] = error
-        self._seen += 1
-        weight = 1.0 / min(self._seen, len(self._errors))
+        self._errors.add(error)
+        weight = 1.0 / len(self._errors.values)
         self._offset = self._offset + weight * (error - self._offset)
-        return None if self._seen % self.configuration.update_every else self.conclude()
+        return None if self._errors.count % self.configuration.update_every else self.conclude()
 
     def conclude(self) -> Parameters:
         """θ with the offset and the back-off as they are."""
-        start, errors = self._start, self._errors[: self._seen] - self._offset
+        start, errors = self._start, self._errors.values - self._offset
         if not len(errors):
             return self._reported
         found = self.backed_off(self._reported.replace({"c_f": self._offset}), errors)
-        if self._seen >= len(self._errors) or not self.configuration.back_off:
+        if len(errors) == self.configuration.memory or not self.configuration.back_off:
             return found
         lower = np.maximum(found["x_l"], start["x_l"])
         upper = np.minimum(found["x_u"], start["x_u"])

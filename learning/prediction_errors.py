@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import casadi as ca
 import numpy as np
 
@@ -89,14 +87,10 @@ def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
 class SortedErrors:
     """Errors (M, n), of each state in ascending order, for means beyond a threshold."""
 
-    KEPT = ("errors",)
+    KEPT = ("errors", "_sum", "_squares")
 
     def __init__(self, errors: Matrix) -> None:
-        self.restore({"errors": errors})
-
-    def restore(self, state: Mapping[str, Matrix]) -> None:
-        """Take other errors."""
-        self.errors = np.sort(state["errors"], axis=0)
+        self.errors = np.sort(errors, axis=0)
         zero = np.zeros((1, self.errors.shape[1]))
         self._sum = np.concatenate([zero, np.cumsum(self.errors, axis=0)])
         self._squares = np.concatenate([zero, np.cumsum(self.errors**2, axis=0)])
@@ -139,23 +133,23 @@ class PredictionErrors:
     s and a. It needs plant data alone, and the errors include those of the model.
     """
 
-    KEPT = ("_errors", "_count")
+    KEPT = ("_errors", "count")
 
     def __init__(self, scenario: Scenario, capacity: int) -> None:
         self._penalty = scenario.state_penalty
         # A row a state: NumPy is three times as fast along the errors as along a few states.
         self._errors = np.zeros((scenario.state_lower.size, capacity))
-        self._count = 0
+        self.count = 0
 
     @property
     def values(self) -> Matrix:
         """The errors kept, (K, n), in no order."""
-        return self._errors[:, : self._count].T
+        return self._errors[:, : self.count].T
 
     def add(self, error: Vector) -> None:
         """Keep an error (n,) in place of the oldest one."""
-        self._errors[:, self._count % self._errors.shape[1]] = error
-        self._count += 1
+        self._errors[:, self.count % self._errors.shape[1]] = error
+        self.count += 1
 
     def expected_penalty(self, prediction: Vector) -> float:
         """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""

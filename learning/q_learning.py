@@ -124,22 +124,16 @@ class QLearningConfiguration(ValueConfiguration):
 class ValueRule(Algorithm):
     """Common part of online and batch Q-learning: prediction errors, a mean cost, coordinates."""
 
-    # The scale comes first: setting it makes step and mean cost, which are restored after it.
-    KEPT: ClassVar[tuple[str, ...]] = ("scale", "_step", "_average_cost", "_errors")
+    KEPT: ClassVar[tuple[str, ...]] = ("_step", "_average_cost", "_errors")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
         self._errors = PredictionErrors(self.scenario, self.configuration.prediction_errors)
-        self.scale = np.ones(self.controller.theta.size)
+        self._measure_in(np.ones(self.controller.theta.size))
 
-    @property
-    def scale(self) -> Vector:
-        """Scale of each entry of θ in the steps' coordinates, (n_θ,)."""
-        return self._step.scale
-
-    @scale.setter
-    def scale(self, scale: Vector) -> None:
+    def _measure_in(self, scale: Vector) -> None:
+        """Begin anew with this scale of each entry of θ in the steps' coordinates, (n_θ,)."""
         self._step = ConstrainedStep(self.controller, self.configuration, scale)
         discount, constants = self.configuration.criterion(self.scenario)
         position = self._step.blocks.slices["c_lambda"].start
@@ -156,14 +150,9 @@ class ValueRule(Algorithm):
         settings, start = self.configuration, self.controller.parameters
         if settings.measure_offset:
             start = start.replace({"c_f": errors.mean(axis=0)})
-        self.scale = prior_deviation(
-            start,
-            states.std(axis=0),
-            errors.std(axis=0),
-            self.strategy.deviation,
-            max(abs(float(start["c_lambda"])), noise),
-            settings.prior_width,
-        )
+        level, action = max(abs(float(start["c_lambda"])), noise), self.strategy.deviation
+        s, e = states.std(axis=0), errors.std(axis=0)
+        self._measure_in(prior_deviation(start, s, e, action, level, settings.prior_width))
         return start
 
 
@@ -191,7 +180,7 @@ class QLearning(ValueRule):
         super().__init__(*arguments)
         settings = self.configuration
         if settings.rule != "kalman" and settings.scaled:
-            self.scale = self.controller.parameters.blocks.scale
+            self._measure_in(self.controller.parameters.blocks.scale)
         self._first: list[list[float]] = []  # rows (s, e, δ)
         self._regression = self._filter(1.0)
         self._count = 0
@@ -238,7 +227,7 @@ class QLearning(ValueRule):
         settings, largest = self.configuration, self.configuration.largest_step or np.inf
         clip, memory = settings.innovation_clip, settings.variance_memory
         drift = settings.parameter_drift
-        return KalmanRegression(self.scale.size, variance, clip, memory, drift, largest)
+        return KalmanRegression(self._step.scale.size, variance, clip, memory, drift, largest)
 
     def _sample_step(self, transition: Transition) -> Update:
         settings = self.configuration
@@ -316,7 +305,7 @@ class AverageCost:
     θ; `start` is the first guess of g.
     """
 
-    KEPT = ("mean_cost",)
+    KEPT = ("mean_cost", "_scale")
 
     def __init__(
         self, discount: float, position: int, scale: float, start: float, memory: int = 0

@@ -104,22 +104,15 @@ class Spent(Exception):
     """The samples are used up."""
 
 
-@dataclass
 class Candidate:
-    """A θ with the mean costs of its stretches: `realised`, and `expected` with pooled errors."""
+    """A θ with the mean `costs` of its stretches so far, of two readings the larger.
 
-    theta: Vector
-    realised: list[float] = field(default_factory=list)
-    expected: list[float] = field(default_factory=list)
+    The realised penalty is rare spikes. The expected one, with pooled errors, is too large where
+    the errors depend on the state, by 10 to 20 a sample near the best back-off of `paper`.
+    """
 
-    @property
-    def costs(self) -> Vector:
-        """The larger of both readings, stretch by stretch.
-
-        The realised penalty is rare spikes. The expected one is too large where the errors depend
-        on the state, by 10 to 20 a sample near the best back-off of `paper`.
-        """
-        return np.maximum(self.realised, self.expected)
+    def __init__(self, theta: Vector) -> None:
+        self.theta, self.costs = theta, np.zeros(0)
 
 
 def cheaper(difference: Vector) -> bool:
@@ -265,7 +258,7 @@ class SearchPlan:
     def _along(self, direction: Vector, reach: float) -> Generator[Trial, None, float]:
         """Line search both ways in scaled θ, (n_θ,); returns the first step of the next time."""
         longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
-        origin, quarter = self.base.theta, max(len(self.base.realised) // 4, 1)
+        origin, quarter = self.base.theta, max(len(self.base.costs) // 4, 1)
         for sign in (1.0, -1.0):
             # Steps that win over a quarter of the stretches are doubled; the longest runs all.
             step, best, costs = sign * min(reach, longest), 0.0, self.base.costs[:quarter]
@@ -352,16 +345,16 @@ class SearchPlan:
 
     def _run(self, candidate: Candidate) -> Plan:
         """One more stretch of a candidate, always on from its last one."""
-        trial = Trial(candidate.theta, self.stretch, rewind=not candidate.realised)
+        trial = Trial(candidate.theta, self.stretch, rewind=not len(candidate.costs))
         told, predictions, errors = yield from self._ask(trial)
         cost, penalty = map(float, told["cost"])
         if "expected" not in told:
-            told["expected"] = np.array(penalty)  # where there is no pool yet
+            told["expected"] = penalty  # where there is no pool yet
             if len(predictions) and len(self._pool.errors):
                 due = expected_penalties(self._penalty, predictions, self._pool)
-                told["expected"] = np.array(due.mean(axis=-1).cumsum()[-1])
-        candidate.realised.append(cost + penalty)
-        candidate.expected.append(cost + float(told["expected"]))
+                told["expected"] = float(due.mean(axis=-1).cumsum()[-1])
+        larger = np.maximum(cost + penalty, cost + told["expected"])
+        candidate.costs = np.append(candidate.costs, larger)
         self._remember(errors)
 
     def renew(self, stretches: int, seed: int | None = None) -> Plan:

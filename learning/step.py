@@ -169,7 +169,7 @@ class ConstrainedStep:
     eigenvalue is the configuration's, or half of the start's where that is less.
     """
 
-    KEPT = ("_smallest",)
+    KEPT = ("scale", "_smallest")
 
     def __init__(
         self, controller: RtiNmpc, configuration: Configuration, scale: Vector | None = None

@@ -196,8 +196,6 @@ class ReplayBuffer:
         Before them which of the transitions they are of: not of those whose QP failed.
         """
         self._forget_other_theta()
-        if not self._controller.memoryless:
-            self._action_value[:] = self._next_value[:] = np.nan
         now, after = self._action_value[: self._count], self._next_value[: self._count]
         self._solve(np.flatnonzero(np.isnan(now + after)))
         kept = np.isfinite(now) & np.isfinite(after)
@@ -205,7 +203,8 @@ class ReplayBuffer:
 
     def _forget_other_theta(self) -> None:
         theta = self._controller.theta
-        if theta is not self._theta and not np.array_equal(theta, self._theta):
+        same = theta is self._theta or np.array_equal(theta, self._theta)
+        if not (same and self._controller.memoryless):
             self._action_value[:] = self._next_value[:] = np.nan
         self._theta = theta
 

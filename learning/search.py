@@ -58,42 +58,14 @@ class Trial(Episode):
     """θ (n_θ,) runs greedily for a stretch, or is where the rule `learns` from.
 
     The rule goes on with its data, or with a `width` begins anew, its prior or trust region so many
-    times as wide. What a stretch may `measure` is dπ/dθ, in the exploration's σ, (m, n_θ).
+    times as wide; it leaves `candidates` (n_θ,), the last one where it ended. What a stretch may
+    `measure` is dπ/dθ, in the exploration's σ, (m, n_θ).
     """
 
     KEPT = (*Episode.KEPT, "candidates")
     learns: bool = False
     width: float | None = None
     candidates: list[Vector] = field(default_factory=list, init=False)
-
-    def predicted(self, model: OneStepModel) -> Told:
-        """What the trial told, with predictions by the controller's own `model`.
-
-        Prediction `errors` s₊ − f(s, a), (K, n). Of learning `candidates` (C, n_θ), the last one
-        where it ended, and `deviations` (2, n) of states and errors. Of a stretch its `cost`, means
-        of stage cost and penalty per sample (2,), its `predictions` f(s, a) (K, n), and `metric`
-        E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ), with Σ = diag σ².
-        """
-        n, rows = model.states, self.samples(3 + model.inputs + model.states)
-        costs, rows = np.array(self.costs), rows[-LATEST:] if self.learns else rows
-        predictions = np.array([model(row[3 : 3 + n], row[3 + n : -n]) for row in rows])
-        predictions = predictions.reshape(-1, n)
-        states, errors = rows[:, 3 : 3 + n], rows[:, -n:] - predictions
-        if self.learns:
-            if not len(rows):
-                states, errors = np.zeros((2, 1, n))
-            deviations = np.array([states.std(axis=0), errors.std(axis=0)])
-            return {"errors": errors, "candidates": self.candidates, "deviations": deviations}
-        # A sample at which the controller failed has its share of J alone.
-        costs[rows[:, 0].astype(int)] = rows[:, 1]
-        total = costs.cumsum()[-1], np.append(0.0, rows[:, 2]).cumsum()[-1]
-        told = {"cost": np.array(total) / self.length}
-        told |= {"errors": errors, "predictions": predictions}
-        if self.measure is not None:
-            jacobians = [J for J in map(np.array, self.measured) if np.isfinite(J).all()]
-            metric = sum((J.T @ J for J in jacobians), np.zeros((self.theta.size,) * 2))
-            told["metric"] = metric / max(len(jacobians), 1)
-        return told
 
 
 Plan = Generator[Trial, None, None]
@@ -546,9 +518,33 @@ class Search(Planned):
         self.needs_points = rule is not None and rule.needs_points
 
     def told(self) -> Told:
-        """What the trial told, predictions included."""
-        trial: Trial = self._episode
-        return trial.predicted(self._model)
+        """What the trial told, with predictions by the controller's own model.
+
+        Prediction `errors` s₊ − f(s, a), (K, n). Of learning `candidates` and `deviations` (2, n)
+        of states and errors. Of a stretch its `cost`, means of stage cost and penalty per sample
+        (2,), its `predictions` f(s, a) (K, n), and `metric` E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ), Σ = diag σ².
+        """
+        trial, model, n = self._episode, self._model, self._model.states
+        rows = trial.samples(3 + model.inputs + n)
+        costs, rows = np.array(trial.costs), rows[-LATEST:] if trial.learns else rows
+        predictions = np.array([model(row[3 : 3 + n], row[3 + n : -n]) for row in rows])
+        predictions = predictions.reshape(-1, n)
+        states, errors = rows[:, 3 : 3 + n], rows[:, -n:] - predictions
+        if trial.learns:
+            if not len(rows):
+                states, errors = np.zeros((2, 1, n))
+            deviations = np.array([states.std(axis=0), errors.std(axis=0)])
+            return {"errors": errors, "candidates": trial.candidates, "deviations": deviations}
+        # A sample at which the controller failed has its share of J alone.
+        costs[rows[:, 0].astype(int)] = rows[:, 1]
+        total = costs.cumsum()[-1], np.append(0.0, rows[:, 2]).cumsum()[-1]
+        told = {"cost": np.array(total) / trial.length}
+        told |= {"errors": errors, "predictions": predictions}
+        if trial.measure is not None:
+            jacobians = [J for J in map(np.array, trial.measured) if np.isfinite(J).all()]
+            metric = sum((J.T @ J for J in jacobians), np.zeros((trial.theta.size,) * 2))
+            told["metric"] = metric / max(len(jacobians), 1)
+        return told
 
     def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
         """Take one sample, of which the rule learns in a phase of learning."""

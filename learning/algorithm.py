@@ -80,37 +80,26 @@ class Update(NamedTuple):
     rewind: bool = False
 
 
-@dataclass(frozen=True)
 class Strategy:
     """Draws the actions that explore: a = sat(c + e), e ~ N(0, diag σ²), on a share of the samples.
 
     The centre c is the policy's action (`additive`) or zero (`literal`, as the paper prints it).
     `probability` is the share, `deviation` σ (m,) or (1,) in the actions' units. The loop saturates
-    at `lower` and `upper` (m,).
+    at `lower` and `upper` (m,). ConfigurationError on a wrong number of deviations.
     """
 
-    kind: str
-    lower: Vector
-    upper: Vector
-    probability: float
-    deviation: Vector
-
-    @classmethod
-    def of(cls, configuration: Configuration, scenario: Scenario) -> Strategy:
-        """The strategy of a configuration; ConfigurationError on a wrong number of deviations."""
-        lower, upper = scenario.action_lower, scenario.action_upper
-        deviation = configuration.exploration_share * (upper - lower)
+    def __init__(self, configuration: Configuration, scenario: Scenario) -> None:
+        self.lower, self.upper = scenario.action_lower, scenario.action_upper
+        self.deviation: Vector = configuration.exploration_share * (self.upper - self.lower)
         if configuration.exploration_deviation is not None:
-            deviation = np.array(configuration.exploration_deviation)
-        if deviation.size not in (1, lower.size):
+            self.deviation = np.array(configuration.exploration_deviation)
+        if self.deviation.size not in (1, self.lower.size):
             raise ConfigurationError(
-                f"exploration_deviation has {deviation.size} entries; give one, or one for each of "
-                f"the {lower.size} actions"
+                f"exploration_deviation has {self.deviation.size} entries; give one, or one for "
+                f"each of the {self.lower.size} actions"
             )
-        kind, probability = configuration.exploration, configuration.exploration_probability
-        if kind == "none":
-            kind, probability = "additive", 0.0
-        return cls(kind, lower, upper, probability, deviation)
+        self.kind, greedy = configuration.exploration, configuration.exploration == "none"
+        self.probability = 0.0 if greedy else configuration.exploration_probability
 
     def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
         """Exploring action (m,) in place of the policy's `action`; None: greedy."""
@@ -135,7 +124,7 @@ class Strategy:
         return mean + (centres - actions)
 
     def _centre(self, action: Vector) -> Vector:
-        return action if self.kind == "additive" else np.zeros_like(action)
+        return np.zeros_like(action) if self.kind == "literal" else action
 
 
 class Algorithm:

@@ -159,7 +159,7 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
     All random numbers come from the run's seed.
     """
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
-    strategy = Strategy.of(run.configuration, run.scenario)
+    strategy = Strategy(run.configuration, run.scenario)
     plant_seed, rng = spawn_seeds(run.seed)
     # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
     own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])

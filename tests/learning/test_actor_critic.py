@@ -20,7 +20,7 @@ def algorithm(problem, scenario, **settings):
         batch_size=400, forgetting=0.0, parametrisation="paper", **settings
     )
     carrier = Carrier(Parameters.naive(problem))
-    strategy = Strategy.of(configuration, scenario)
+    strategy = Strategy(configuration, scenario)
     return carrier, ActorCritic(
         carrier, scenario, configuration, 4000, strategy, np.random.default_rng(0)
     )

@@ -426,14 +426,15 @@ class Identified(Estimate):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
-        self._rows: list[Vector] = []
+        self._rows: list[list[float]] = []
         self._every = self.configuration.every
         if self._every is None and self.asks_for == "operation":
             self._every = max(round(SHIFT / self.scenario.sampling_time), 1)
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Keep a transition; the last of every `every` gives a new fit."""
-        self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
+        sample = transition.s, transition.a, transition.next_s
+        self._rows.append(np.concatenate(sample).tolist())
         if len(self._rows) != self._every:
             return None
         fitted = self.conclude()

@@ -86,7 +86,8 @@ def _flat(run: Mapping[str, Any]) -> dict[str, Any]:
 def arrays_of(part: Any) -> State:
     """The state of an object: what its class names in `KEPT`, or a dataclass's fields.
 
-    They may be objects of this kind, or with a method `state`.
+    They may be objects of this kind, or with a method `state`. A list becomes an array: JSON is
+    slow.
     """
     return {name: _state(getattr(part, name)) for name in _kept(part) or ()}
 
@@ -103,12 +104,14 @@ def take_up(part: Any, state: State) -> None:
         elif _kept(present) is not None:
             take_up(present, value)
         else:
-            setattr(part, name, deepcopy(value))
+            setattr(part, name, list(value) if isinstance(present, list) else deepcopy(value))
 
 
 def _state(value: Any) -> Any:
     if callable(getattr(value, "state", None)):
         return value.state()
+    if isinstance(value, list):
+        return np.array(value)
     return deepcopy(value) if _kept(value) is None else arrays_of(value)
 
 

@@ -663,7 +663,7 @@ class _Session:
         state |= {
             "plant": np.frombuffer(plant, dtype=np.uint8),
             "rows": [[*row.values()] for row in self.rows],
-            "row_thetas": [row.parameters.theta for row in self.rows],
+            "row_thetas": np.array([row.parameters.theta for row in self.rows]),
         }
         checkpoint.save(self.out / CHECKPOINT, self.identity, state)
 

@@ -23,7 +23,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.batch_q_learning import BatchQLearning
 from learning.configuration import Configuration, Count
 from learning.episodes import Episode, Planned, Told
-from learning.errors import ConfigurationError, DivergenceError
+from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel, SortedErrors, expected_penalties
 from learning.q_learning import QLearning
 from learning.step import clip_eigenvalues, prior_deviation, smallest_eigenvalue
@@ -406,15 +406,12 @@ class SearchPlan:
 
 
 class SearchConfiguration(Configuration):
-    """Settings of the search; those of its rule are the table `rule_settings`."""
+    """Settings of the search; its rule has its own defaults but for `RULE_DEFAULTS`."""
 
     rule: Literal["none", "q-learning", "batch-q-learning", "actor-critic"] = Field(
         "none",
         description="what learns in the phases between the comparisons; none: θ rests in them, and "
         "they last stretches × stretch samples",
-    )
-    rule_settings: dict[str, Any] = Field(
-        {}, description="the rule's own settings, as rule_settings = {prior_width = 0.1}"
     )
     q_learning_first: bool = Field(
         False,
@@ -426,34 +423,26 @@ class SearchConfiguration(Configuration):
     stretches: Count = Field(8, description="stretches of a comparison that is not decided before")
 
     def rule_configuration(self, name: str) -> Any:
-        """Settings of a rule in the search: those that they share, and the rule's own."""
+        """Settings of a rule in the search: those that they share, and `RULE_DEFAULTS`."""
         shared = {field: getattr(self, field) for field in Configuration.model_fields}
-        own = self.rule_settings if name == self.rule else {}
         rule = RULES[name].Configuration
-        shared |= {key: value for key, value in RULE_DEFAULTS.items() if key in rule.model_fields}
+        own = {key: value for key, value in RULE_DEFAULTS.items() if key in rule.model_fields}
         return rule.from_dict(shared | own)
 
     def without_part(self) -> Mapping[str, str]:
         """Settings without effect in a search without a rule."""
-        names = ("phase", "rule_settings", "q_learning_first") if self.rule == "none" else ()
+        names = ("phase", "q_learning_first") if self.rule == "none" else ()
         return dict.fromkeys(names, "a search without a rule")
 
     @model_validator(mode="after")
     def _take_over_from_the_rule(self) -> Self:
-        """Explore as the rule would, unless told otherwise; refuse settings that it lacks."""
-        if shared := sorted(self.rule_settings.keys() & Configuration.model_fields.keys()):
-            raise ValueError(f"rule_settings: {shared[0]} is a setting of the search itself")
+        """Explore as the rule would, unless told otherwise."""
         rule = "q-learning" if self.rule == "none" else self.rule
         fields = RULES[rule].Configuration.model_fields
         for name in ("exploration_probability", "exploration_share"):
             if name not in self.model_fields_set:
                 # Not by `setattr`: it is still a default, which a scenario may replace.
                 self.__dict__[name] = fields[name].default
-        if self.rule != "none":
-            try:
-                self.rule_configuration(self.rule)
-            except ConfigurationError as error:
-                raise ValueError(f"rule_settings: {error}") from None
         return self
 
 

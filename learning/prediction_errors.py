@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from controllers.economic import linear_model
 from controllers.functions import StackedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
@@ -30,9 +31,7 @@ class OneStepModel:
         step = discretise(model, problem.sampling_time, problem.substeps)
         x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
         d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
-        next_state = step(x, u, d, p)
-        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": next_state})
-        self._transition = ca.Function("A", [x, u], [ca.jacobian(next_state, x)])
+        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": step(x, u, d, p)})
         self._problem, self._model = problem, model
         free = ca.SX.sym("p", len(model.parameters))
         given = {"x": x, "u": u, "p": free}
@@ -47,8 +46,7 @@ class OneStepModel:
 
     def slowest(self) -> float:
         """Samples of f's slowest time constant at the reference, `SLOWEST` at most."""
-        transition = self._transition(self._problem.reference_state, self._problem.reference_action)
-        largest = np.abs(np.linalg.eigvals(transition.full())).max()
+        largest = np.abs(np.linalg.eigvals(linear_model(self._problem)[0])).max()
         return float(1.0 / max(1.0 - largest, 1.0 / SLOWEST))
 
     def parameters(self, theta: Parameters) -> Vector:

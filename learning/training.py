@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import reduce
 from importlib.metadata import version
-from itertools import islice
 from math import gcd, inf, isfinite, isnan
 from operator import add
 from pathlib import Path
@@ -637,12 +636,10 @@ class _Session:
 
     def trouble(self, row: LogRow, judge: Judge) -> str | None:
         """Why the run must stop, or None: two evaluations in a row, or the last, are too dear."""
-        greedy = row["greedy_J"]
-        if not isfinite(greedy) or not greedy > (limit := judge.limit):
-            return None
-        earlier = (last["greedy_J"] for last in islice(reversed(self.rows), 1, None))
-        before = next((judged for judged in earlier if isfinite(judged)), limit)
-        if before <= limit and row["samples"] < self.run.samples:
+        greedy, limit = row["greedy_J"], judge.limit
+        judged = [one["greedy_J"] for one in self.rows if isfinite(one["greedy_J"])]
+        once = len(judged) < 2 or judged[-2] <= limit
+        if not limit < greedy < inf or (once and row["samples"] < self.run.samples):
             return None
         reason = f"greedy J = {shown(greedy)} exceeds {shown(limit)}"
         return f"diverged: {reason} at sample {int(row['samples'])}"

@@ -13,7 +13,7 @@ from typing import Any
 
 import clarabel
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from controllers.economic import solve_conic, svec_order
@@ -248,13 +248,13 @@ def prior_deviation(
     initial = np.maximum(terminal, np.sqrt(np.abs(np.diag(start["B_lambda"]))))
     dearest = float((stage * move).max())
     bound = BACK_OFF * width / 0.3 * np.maximum(error_deviation, SLOW * state_deviation)
-    widths = {
-        "B_lambda": width * _packed(initial),
+    widths: dict[str, ArrayLike] = {
+        "B_lambda": width * np.outer(initial, initial),
         "b_lambda": width * np.maximum(terminal * dearest, np.abs(start["b_lambda"])),
-        "c_lambda": np.array([LEVEL * abs(level)]),
-        "B_Vf": width * _packed(terminal),
+        "c_lambda": LEVEL * abs(level),
+        "B_Vf": width * np.outer(terminal, terminal),
         "b_Vf": width * np.maximum(terminal * dearest, GRADIENT * np.abs(start["b_Vf"])),
-        "B_l": width * _packed(stage),
+        "B_l": width * np.outer(stage, stage),
         "b_l": width * np.maximum(stage * dearest, GRADIENT * np.abs(start["b_l"])),
         "c_f": OFFSET * error_deviation,
         "x_l": bound,
@@ -264,16 +264,10 @@ def prior_deviation(
         if name in start.blocks:
             widths[name] = width * np.abs(start[name])
     floor = np.finfo(np.float64).tiny ** 0.25
-    deviation: Vector = np.concatenate([widths[block.name] for block in start.blocks])
-    return np.maximum(deviation, floor)
+    packed = [block.pack(widths[block.name]) for block in start.blocks]
+    return np.maximum(np.concatenate(packed), floor)
 
 
 def _root_diagonal(matrix: NDArray[np.float64]) -> Vector:
     root: Vector = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     return root
-
-
-def _packed(root: Vector) -> Vector:
-    """D_i D_j of the upper triangle, row by row."""
-    triangle: Vector = np.outer(root, root)[np.triu_indices(root.size)]
-    return triangle

@@ -232,6 +232,7 @@ class Counts:
     (`weakly_active`) and with dependent active constraints (`licq_failed`).
     """
 
+    KEPT: ClassVar = ("number", "failures", "explored", "saturated", "weakly_active", "licq_failed")
     number: int = 0
     failures: int = 0
     explored: int = 0

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -84,12 +83,12 @@ def _flat(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def arrays_of(part: Any) -> State:
-    """The state of an object: what its class names in `KEPT`, or a dataclass's fields.
+    """The state of an object: what its class names in `KEPT`.
 
     They may be objects of this kind, or with a method `state`. A list becomes an array: JSON is
     slow.
     """
-    return {name: _state(getattr(part, name)) for name in _kept(part) or ()}
+    return {name: _state(getattr(part, name)) for name in part.KEPT}
 
 
 def take_up(part: Any, state: State) -> None:
@@ -97,11 +96,11 @@ def take_up(part: Any, state: State) -> None:
 
     A part with a method `restore` uses it. Raises KeyError where one is missing.
     """
-    for name in _kept(part) or ():
+    for name in part.KEPT:
         present, value = getattr(part, name), state[name]
         if hasattr(present, "restore"):
             present.restore(value)
-        elif _kept(present) is not None:
+        elif hasattr(present, "KEPT"):
             take_up(present, value)
         else:
             setattr(part, name, list(value) if isinstance(present, list) else deepcopy(value))
@@ -112,12 +111,4 @@ def _state(value: Any) -> Any:
         return value.state()
     if isinstance(value, list):
         return np.array(value)
-    return deepcopy(value) if _kept(value) is None else arrays_of(value)
-
-
-def _kept(value: Any) -> Iterable[str] | None:
-    """Names of what a checkpoint has of an object; None of a value that is kept whole."""
-    names: Iterable[str] | None = getattr(value, "KEPT", None)
-    if names is None and is_dataclass(value):
-        return [item.name for item in fields(value)]
-    return names
+    return arrays_of(value) if hasattr(value, "KEPT") else deepcopy(value)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
@@ -47,12 +46,15 @@ class ActorCritic(Algorithm):
 
     θ stays for a batch. Then LSTDV fits the smooth part W of V = penalty + W, and LSTDQ the weights
     w of the advantage A(s, a) = (a − π(s) − bias)ᵀ ∇π(s)ᵀ w. `bias` is the exploration's mean under
-    saturation. The known penalty is moved to the next state, r = ℓ + γ·penalty(s₊), so that the
-    critic meets no kink. Its discount γ is 1, that of the mean cost.
+    saturation. The policy is greedy in s₊, where A vanishes, so LSTDQ with V held is a regression
+    of LSTDV's TD errors on ψ = (a − π(s) − bias)ᵀ ∇π(s)ᵀ. Each earlier batch counts `forgetting`
+    times as much in it as the next one, which lowers the gradient's noise. The known penalty is
+    moved to the next state, r = ℓ + γ·penalty(s₊), so that the critic meets no kink. Its discount γ
+    is 1, that of the mean cost.
     """
 
     Configuration = ActorCriticConfiguration
-    KEPT = ("_batch", "_advantage", "_filled")
+    KEPT = ("_batch", "_information", "_moment", "_filled")
     configuration: ActorCriticConfiguration
 
     def __init__(self, *arguments: Any) -> None:
@@ -62,28 +64,22 @@ class ActorCritic(Algorithm):
         # Actions are in units of the exploration's standard deviation.
         self._unit = np.broadcast_to(self.strategy.deviation, scenario.action_lower.shape)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
-        rows = settings.batch_size
-        self._batch: dict[str, NDArray[Any]] = {
-            "states": np.zeros((rows, n)),
-            "next_states": np.zeros((rows, n)),
-            "reward": np.zeros(rows),
-            "policy": np.zeros((rows, m)),
-            "deviation": np.zeros((rows, m)),
-            "explored": np.zeros(rows, dtype=bool),
-            "jacobian": np.zeros((rows, m, size)),
-        }
-        self._advantage = AdvantageRegression(size, settings.forgetting, settings.ridge)
+        columns = [
+            ("s", float, n), ("next_s", float, n), ("reward", float), ("policy", float, m),
+            ("deviation", float, m), ("explored", bool), ("jacobian", float, (m, size)),
+        ]  # fmt: skip
+        self._batch = np.zeros(settings.batch_size, columns)
+        self._information: Matrix = np.zeros((size, size))
+        self._moment: Vector = np.zeros(size)
         self._filled = 0
 
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
-        batch, row = self._batch, self._filled
-        batch["states"][row], batch["next_states"][row] = transition.s, transition.next_s
-        batch["reward"][row] = transition.stage_cost + transition.next_penalty
-        policy = transition.policy.action
-        batch["policy"][row], batch["deviation"][row] = policy, transition.a - policy
-        batch["explored"][row] = transition.explored
-        batch["jacobian"][row] = transition.policy.policy_jacobian
+        policy, reward = transition.policy, transition.stage_cost + transition.next_penalty
+        self._batch[self._filled] = (
+            *(transition.s, transition.next_s, reward, policy.action),
+            *(transition.a - policy.action, transition.explored, policy.policy_jacobian),
+        )
         self._filled += 1
         if self._filled < self.configuration.batch_size:
             return None
@@ -92,11 +88,10 @@ class ActorCritic(Algorithm):
 
     def _deviation(self) -> Vector:
         """a − π(s) of the batch, (K, m), less its mean under saturation; zero in greedy samples."""
-        batch = self._batch
-        explored = batch["explored"]
-        bias = self.strategy.bias(batch["policy"][explored])
-        deviation: Matrix = np.zeros_like(batch["deviation"])
-        deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
+        explored = self._batch["explored"]
+        bias = self.strategy.bias(self._batch["policy"][explored])
+        deviation = np.where(explored[:, None], self._batch["deviation"], 0.0)
+        deviation[explored] -= np.nan_to_num(bias)
         return deviation / self._unit
 
     def gradient(self) -> tuple[Vector, Matrix, Vector]:
@@ -104,13 +99,15 @@ class ActorCritic(Algorithm):
 
         Also the TD errors, (K,). The batch counts in the advantage from there on.
         """
-        batch = self._batch
-        errors = lstdv(batch["states"], batch["next_states"], batch["reward"])
+        batch, settings = self._batch, self.configuration
+        errors = lstdv(*(batch[name].copy() for name in ("s", "next_s", "reward")))
         jacobian = batch["jacobian"] * self._step.scale / self._unit[:, None]
-        advantage = np.einsum("kmi,km->ki", jacobian, self._deviation())
-        self._advantage.add(advantage, errors)
+        psi = np.einsum("kmi,km->ki", jacobian, self._deviation())
+        self._information = settings.forgetting * self._information + psi.T @ psi
+        self._moment = settings.forgetting * self._moment + psi.T @ errors
         fisher = np.einsum("kmi,kmj->ij", jacobian, jacobian) / len(errors)
-        return fisher @ self._advantage.weights(), fisher, errors
+        weights = regression(self._information, self._moment, settings.ridge)
+        return fisher @ weights, fisher, errors
 
     def _update(self, number: int) -> Update:
         settings = self.configuration
@@ -151,30 +148,9 @@ def lstdv(states: Matrix, next_states: Matrix, reward: Vector) -> Vector:
     return errors
 
 
-class AdvantageRegression:
-    """LSTDQ for the weights w (n_θ,) of the compatible advantage A = ψᵀw, given LSTDV's TD errors.
-
-    The policy is greedy in s₊, where A vanishes, so LSTDQ with V held is a regression of the TD
-    errors on ψ. Each earlier batch counts `forgetting` times as much as the next one, which lowers
-    the gradient's noise. `ridge` is relative to the mean of the information's diagonal.
-    """
-
-    KEPT = ("information", "moment")
-
-    def __init__(self, size: int, forgetting: float, ridge: float) -> None:
-        self._forgetting, self._ridge = forgetting, ridge
-        self.information: Matrix = np.zeros((size, size))
-        self.moment: Vector = np.zeros(size)
-
-    def add(self, features: Matrix, td_errors: Vector) -> None:
-        """Take a batch: ψ (K, n_θ) and TD errors (K,)."""
-        self.information = self._forgetting * self.information + features.T @ features
-        self.moment = self._forgetting * self.moment + features.T @ td_errors
-
-    def weights(self) -> Vector:
-        """Regression's w, (n_θ,)."""
-        size = self.moment.size
-        floor = max(float(np.trace(self.information)), np.finfo(float).tiny) / size
-        factor = cho_factor(self.information + self._ridge * floor * np.eye(size))
-        weights: Vector = cho_solve(factor, self.moment)
-        return weights
+def regression(information: Matrix, moment: Vector, ridge: float) -> Vector:
+    """Weights (n,) of Σψψᵀ and Σψδ; the ridge is relative to the mean of the first's diagonal."""
+    floor = max(float(np.trace(information)), np.finfo(float).tiny) / moment.size
+    factor = cho_factor(information + ridge * floor * np.eye(moment.size))
+    weights: Vector = cho_solve(factor, moment)
+    return weights

@@ -12,7 +12,6 @@ from math import inf
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
@@ -23,7 +22,7 @@ from cosim.protocols import Matrix, Plant, Step, Vector
 from cosim.scenario import Scenario
 from cosim.simulation import recover
 from cosim.validation import suggestion
-from learning.checkpoint import arrays_of, as_array, from_array, group, prefixed, take_up
+from learning.checkpoint import State, arrays_of, take_up
 from learning.configuration import Configuration
 from learning.errors import AlgorithmLookupError, ConfigurationError, PrivilegeError
 
@@ -81,37 +80,26 @@ class Update(NamedTuple):
     rewind: bool = False
 
 
-@dataclass(frozen=True)
 class Strategy:
     """Draws the actions that explore: a = sat(c + e), e ~ N(0, diag σ²), on a share of the samples.
 
     The centre c is the policy's action (`additive`) or zero (`literal`, as the paper prints it).
     `probability` is the share, `deviation` σ (m,) or (1,) in the actions' units. The loop saturates
-    at `lower` and `upper` (m,).
+    at `lower` and `upper` (m,). ConfigurationError on a wrong number of deviations.
     """
 
-    kind: str
-    lower: Vector
-    upper: Vector
-    probability: float
-    deviation: Vector
-
-    @classmethod
-    def of(cls, configuration: Configuration, scenario: Scenario) -> Strategy:
-        """The strategy of a configuration; ConfigurationError on a wrong number of deviations."""
-        lower, upper = scenario.action_lower, scenario.action_upper
-        deviation = configuration.exploration_share * (upper - lower)
+    def __init__(self, configuration: Configuration, scenario: Scenario) -> None:
+        self.lower, self.upper = scenario.action_lower, scenario.action_upper
+        self.deviation: Vector = configuration.exploration_share * (self.upper - self.lower)
         if configuration.exploration_deviation is not None:
-            deviation = np.array(configuration.exploration_deviation)
-        if deviation.size not in (1, lower.size):
+            self.deviation = np.array(configuration.exploration_deviation)
+        if self.deviation.size not in (1, self.lower.size):
             raise ConfigurationError(
-                f"exploration_deviation has {deviation.size} entries; give one, or one for each of "
-                f"the {lower.size} actions"
+                f"exploration_deviation has {self.deviation.size} entries; give one, or one for "
+                f"each of the {self.lower.size} actions"
             )
-        kind, probability = configuration.exploration, configuration.exploration_probability
-        if kind == "none":
-            kind, probability = "additive", 0.0
-        return cls(kind, lower, upper, probability, deviation)
+        self.kind, greedy = configuration.exploration, configuration.exploration == "none"
+        self.probability = 0.0 if greedy else configuration.exploration_probability
 
     def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
         """Exploring action (m,) in place of the policy's `action`; None: greedy."""
@@ -136,7 +124,7 @@ class Strategy:
         return mean + (centres - actions)
 
     def _centre(self, action: Vector) -> Vector:
-        return action if self.kind == "additive" else np.zeros_like(action)
+        return np.zeros_like(action) if self.kind == "literal" else action
 
 
 class Algorithm:
@@ -186,11 +174,11 @@ class Algorithm:
         """Take one sample; move θ and say so, or return None."""
         return None
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> State:
         """State for a checkpoint, without θ."""
         return arrays_of(self)
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+    def restore(self, state: State) -> None:
         """Restore what `state` returned."""
         take_up(self, state)
 
@@ -244,6 +232,7 @@ class Counts:
     (`weakly_active`) and with dependent active constraints (`licq_failed`).
     """
 
+    KEPT: ClassVar = ("number", "failures", "explored", "saturated", "weakly_active", "licq_failed")
     number: int = 0
     failures: int = 0
     explored: int = 0
@@ -281,9 +270,7 @@ class TrainingLoop:
         self._plant = PlantInOperation(plant) if operates else plant
         self.controller, self.algorithm, self.rng = controller, algorithm, rng
         self._strategy = strategy
-        self._generators = {"rng": rng}
-        if algorithm_rng is not None:
-            self._generators["algorithm_rng"] = algorithm_rng
+        self._generators = [rng] if algorithm_rng is None else [rng, algorithm_rng]
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
@@ -432,35 +419,27 @@ class TrainingLoop:
         else:
             self.renew()
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> State:
         """State for `restore`, without the plant's."""
-        state = arrays_of(self) | {"theta": self.controller.theta} | _stored("point", self._point)
+        state = arrays_of(self) | {"theta": self.controller.theta, "point": self._point}
+        state["generators"] = [rng.bit_generator.state for rng in self._generators]
         if self._marked is not None:
-            content = self.simulator("mark").serialise(self._marked[0])
-            state |= {"marked": np.frombuffer(content, np.uint8), "marked_s": self._marked[1]}
-            state |= _stored("marked_point", self._marked[2])
-        generators = self._generators.items()
-        return state | {name: as_array(rng.bit_generator.state) for name, rng in generators}
+            snapshot, s, point = self._marked
+            content = np.frombuffer(self.simulator("mark").serialise(snapshot), np.uint8)
+            state["marked"] = content, s, point
+        return state
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+    def restore(self, state: State) -> None:
         """Restore what `state` returned; the plant must have been restored before."""
         self.controller.theta = state["theta"]
         take_up(self, state)
         # Only now: a rule may draw again what it drew before.
-        for name, rng in self._generators.items():
-            rng.bit_generator.state = from_array(state[name])
+        for rng, drawn in zip(self._generators, state["generators"], strict=True):
+            rng.bit_generator.state = drawn
         self._marked = None
         if "marked" in state:
-            snapshot = self.simulator("mark").deserialise(state["marked"].tobytes())
-            self._marked = (snapshot, state["marked_s"], _point("marked_point", state))
-        self._point = _point("point", state)
+            content, s, point = state["marked"]
+            snapshot = self.simulator("mark").deserialise(content.tobytes())
+            self._marked = snapshot, s, point and LinearisationPoint(*point)
+        self._point = state["point"] and LinearisationPoint(*state["point"])
         self.restart()
-
-
-def _stored(name: str, point: LinearisationPoint | None) -> dict[str, Vector]:
-    return {} if point is None else prefixed(f"{name} ", point._asdict())
-
-
-def _point(name: str, arrays: dict[str, Vector]) -> LinearisationPoint | None:
-    parts = group(arrays, f"{name} ")
-    return LinearisationPoint(**parts) if parts else None

@@ -8,11 +8,10 @@ before each of its stretches, on the same noise.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import least_squares
 
@@ -27,7 +26,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import Configuration, Count
 from learning.episodes import Episode, Planned, Told
 from learning.errors import ConfigurationError, DivergenceError
-from learning.prediction_errors import OneStepModel, known_penalty
+from learning.prediction_errors import OneStepModel, PredictionErrors, known_penalty
 from learning.step import moved
 
 BackOffToo = Annotated[bool, Field(description="search the back-off of the active bounds")]
@@ -95,32 +94,6 @@ class IdentifiedConfiguration(GreedyConfiguration):
         return super().learned_parameters(model) or model.uncertain
 
 
-@dataclass(eq=False)
-class Segment(Episode):
-    """A stretch of operation; `asked` are the places in θ of the bounds (2n,) that may bind."""
-
-    KEPT = (*Episode.KEPT, "rows", "binding")
-    asked: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-
-    def __post_init__(self) -> None:
-        self.rows: list[Vector] = []
-        self.binding: Vector = np.zeros(self.asked.size)
-
-    def take(self, transition: Transition | None, cost: float) -> bool:
-        """Keep a sample."""
-        if transition is not None:
-            measured = (transition.s, transition.a, transition.next_s)
-            self.rows.append(np.concatenate([[self.done, transition.stage_cost], *measured]))
-            if self.asked.size:
-                self.binding += transition.policy.value_gradient[self.asked] != 0
-        return super().take(transition, cost)
-
-    def told(self) -> Told:
-        """Rows of number, stage cost, s, a and s₊, (K, 2+2n+m); how often each bound bound."""
-        rows = np.array(self.rows) if self.rows else np.zeros((0, 2 + self.asked.size))
-        return {"rows": rows, "binding": self.binding / self.length}
-
-
 class BackOffSearch:
     """Finds the κ of least cost for the active bounds x_l + κσ and x_u − κσ.
 
@@ -147,6 +120,9 @@ class BackOffSearch:
         self._penalty, self._model = scenario.state_penalty, OneStepModel(scenario)
         self._settling = problem.horizon
         self._n = n = problem.n_states
+        self._columns = 3 + 2 * n + problem.n_actions
+        places, slices = np.arange(start.theta.size), start.blocks.slices
+        self._bounds = np.concatenate([places[slices["x_l"]], places[slices["x_u"]]])
         self._true = (scenario.state_lower, scenario.state_upper)
         self._seeds = rng.integers(2**63, size=2 * n * len(PHASES)).tolist()
         self.kappa = np.zeros(2 * n)
@@ -167,20 +143,27 @@ class BackOffSearch:
         lower[crossed], upper[crossed] = middle[crossed] - 1e-6, middle[crossed] + 1e-6
         return self.start.replace({"x_l": lower, "x_u": upper})
 
-    def plan(self) -> Iterator[Segment]:
+    def told(self, segment: Episode) -> Told:
+        """Rows of a segment, and how often each bound bound, (2n,), where that was measured."""
+        binding = np.reshape(segment.measured, (-1, 2 * self._n)).sum(axis=0) / segment.length
+        return {"rows": segment.samples(self._columns), "binding": binding}
+
+    def _segment(self, number: int, steps: int, kappa: Vector) -> Episode:
+        """A stretch of operation; in the first round the bounds that bind are counted."""
+        segment = Episode(self.at(kappa).theta, steps, self._seeds[number])
+        if not number:
+            segment.measure = lambda sample, _: sample.policy.value_gradient[self._bounds] != 0
+        return segment
+
+    def plan(self) -> Iterator[Episode]:
         """The whole search; the segments of a round meet the same noise."""
-        n, slices = self._n, self.start.blocks.slices
-        bounds = np.concatenate(
-            [np.arange(self.start.theta.size)[slices[b]] for b in ("x_l", "x_u")]
-        )
-        steps = self._budget // SEGMENTS
-        segment = Segment(self.theta.theta, steps, self._seeds[0], asked=bounds)
-        yield segment
+        n = self._n
+        yield (segment := self._segment(0, self._budget // SEGMENTS, self.kappa))
         rows, share = segment.answer["rows"], segment.answer["binding"]
         if not len(rows) or share.max() < BINDING:
             return
-        states, following = rows[:, 2 : 2 + n], rows[:, -n:]
-        errors = self._model.errors(states, rows[:, 2 + n : -n], following, self.start)
+        states, following = rows[:, 3 : 3 + n], rows[:, -n:]
+        errors = self._model.errors(states, rows[:, 3 + n : -n], following, self.start)
         self._unit = errors.std(axis=0)
         first = int(np.argmax(share))
         schedule, tried = [(first, 0)], [self._settled(segment, 0, 0.0)]
@@ -190,9 +173,7 @@ class BackOffSearch:
             left = 13 / sum(PHASES[later][0] for _, later in schedule[1:]) if number else 1.0
             steps, kappas = self._segments(bound, phase, left)
             for kappa in kappas[0 if number else 1 :]:
-                asked = bounds[: 0 if number else None]
-                segment = Segment(self.at(kappa).theta, steps, self._seeds[number], asked=asked)
-                yield segment
+                yield (segment := self._segment(number, steps, kappa))
                 tried.append(self._settled(segment, number, kappa[bound]))
                 share = share if number else np.maximum(share, segment.answer["binding"])
             self.kappa[bound], segment.refused = self._best(bound, phase, np.concatenate(tried))
@@ -201,10 +182,10 @@ class BackOffSearch:
                 schedule += [(other, phase) for other in others for phase in range(3)]
                 schedule += [(first, 1), (first, 2)]
 
-    def _settled(self, segment: Segment, number: int, kappa: float) -> Matrix:
+    def _settled(self, segment: Episode, number: int, kappa: float) -> Matrix:
         """Round, κ, stage cost and state, (K, 3+n), of a segment once the loop has settled."""
         rows = segment.answer["rows"]
-        rows = rows[rows[:, 0] >= self._settling, 1 : 2 + self._n]
+        rows = rows[rows[:, 0] >= self._settling][:, [1, *range(3, 3 + self._n)]]
         return np.hstack([np.full((len(rows), 2), (number, kappa)), rows])
 
     def _segments(self, bound: int, phase: int, left: float) -> tuple[int, list[Vector]]:
@@ -292,6 +273,10 @@ class BackOff(Planned):
         """θ with the best back-offs found so far, (n_θ,)."""
         return self._search.theta.theta
 
+    def told(self) -> Told:
+        """What the segment told."""
+        return self._search.told(self._episode)
+
 
 class BackOffSimulator(BackOff):
     """`BackOff` on a plant that is put back before each stretch."""
@@ -315,16 +300,15 @@ class Estimate(Planned):
         self._start = self.controller.parameters
         self._found = self._start.theta
         self._search: BackOffSearch | None = None
-        simulates = self.asks_for == "simulator"
-        # In operation the estimation does not end with the run: what it would conclude is learnt.
-        samples = self.samples if simulates else self.samples + 1
-        if simulates and self.configuration.back_off:
-            samples = max(round(ESTIMATION * self.samples), 1)
-            left = self.samples - samples
+        if self.asks_for == "simulator" and self.configuration.back_off:
+            left = self.samples - max(round(ESTIMATION * self.samples), 1)
             self._search = BackOffSearch(self._start, self.scenario, left, self.rng)
-        self.follow(self._estimate_and_search(samples))
+        self.follow(self._estimate_and_search())
 
-    def _estimate_and_search(self, samples: int) -> Iterator[Episode]:
+    def _estimate_and_search(self) -> Iterator[Episode]:
+        if self.asks_for == "operation":
+            return  # the estimation does not end
+        samples = max(round(ESTIMATION * self.samples), 1) if self._search else self.samples
         yield (estimation := Episode(self._found, samples))
         self._found = estimation.answer["theta"]
         if self._search is not None:
@@ -351,8 +335,10 @@ class Estimate(Planned):
         return self._start.with_theta(self._found)
 
     def told(self) -> Told:
-        """What the episode told; the estimate's θ."""
-        return super().told() if self._history else {"theta": self.conclude().theta}
+        """The estimate's θ, then what a segment of the search told."""
+        if self._search is None or not self._history:
+            return {"theta": self.conclude().theta}
+        return self._search.told(self._episode)
 
     def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
         """Take one sample of the estimation or of the search."""
@@ -389,33 +375,31 @@ class OffsetFree(Estimate):
     """
 
     Configuration = OffsetFreeConfiguration
-    KEPT = (*Estimate.KEPT, "_offset", "_seen", "_errors")
+    KEPT = (*Estimate.KEPT, "_offset", "_errors")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
         self._parameters = self._model.parameters(self._start)
         self._offset = self._start["c_f"]
-        self._errors = np.zeros((self.configuration.memory, len(self._offset)))
-        self._seen = 0
+        self._errors = PredictionErrors(self.scenario, self.configuration.memory)
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Filter the error of one prediction."""
         predicted = self._model.predict(transition.s, transition.a, self._parameters)[0]
         error = transition.next_s - predicted
-        self._errors[self._seen % len(self._errors)] = error
-        self._seen += 1
-        weight = 1.0 / min(self._seen, len(self._errors))
+        self._errors.add(error)
+        weight = 1.0 / len(self._errors.values)
         self._offset = self._offset + weight * (error - self._offset)
-        return None if self._seen % self.configuration.update_every else self.conclude()
+        return None if self._errors.count % self.configuration.update_every else self.conclude()
 
     def conclude(self) -> Parameters:
         """θ with the offset and the back-off as they are."""
-        start, errors = self._start, self._errors[: self._seen] - self._offset
+        start, errors = self._start, self._errors.values - self._offset
         if not len(errors):
             return self._reported
         found = self.backed_off(self._reported.replace({"c_f": self._offset}), errors)
-        if self._seen >= len(self._errors) or not self.configuration.back_off:
+        if len(errors) == self.configuration.memory or not self.configuration.back_off:
             return found
         lower = np.maximum(found["x_l"], start["x_l"])
         upper = np.minimum(found["x_u"], start["x_u"])
@@ -442,14 +426,15 @@ class Identified(Estimate):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
-        self._rows: list[Vector] = []
+        self._rows: list[list[float]] = []
         self._every = self.configuration.every
         if self._every is None and self.asks_for == "operation":
             self._every = max(round(SHIFT / self.scenario.sampling_time), 1)
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Keep a transition; the last of every `every` gives a new fit."""
-        self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
+        sample = transition.s, transition.a, transition.next_s
+        self._rows.append(np.concatenate(sample).tolist())
         if len(self._rows) != self._every:
             return None
         fitted = self.conclude()

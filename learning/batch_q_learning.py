@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import isnan
 from typing import Any
 
@@ -17,7 +16,7 @@ from cosim.protocols import Matrix, Vector
 from learning.algorithm import Transition, Update
 from learning.configuration import Count
 from learning.errors import DivergenceError
-from learning.q_learning import OUTLIER, AverageCost, ValueConfiguration, ValueRule
+from learning.q_learning import OUTLIER, ValueConfiguration, ValueRule
 from learning.step import Fit
 
 POINT = tuple(f"point_{name}" for name in LinearisationPoint._fields)
@@ -90,20 +89,20 @@ class BatchQLearning(ValueRule):
         settings, update, failures = self.configuration, None, 0
         information = self._information
         for _ in range(settings.relinearisations):
-            replayed = self._buffer.replay(self._average_cost)
-            failures += replayed.failures
-            if not len(replayed.rows):
+            kept, action_value, next_value, gradient = self._buffer.replay()
+            failures += len(kept) - len(action_value)
+            if not len(action_value):
                 break
+            cost, correction = (self._buffer.rows[name][kept] for name in ("cost", "correction"))
+            target = self._average_cost.target(cost, next_value)
             # The next penalty is replaced by its expectation.
-            corrections = self._buffer.rows["correction"][replayed.rows]
-            corrections = self._average_cost.discount * corrections
-            td_error = replayed.target - replayed.action_value + corrections
+            td_error = target - action_value + self._average_cost.discount * correction
             if not np.isfinite(td_error).all():
                 raise DivergenceError("TD errors are not finite")
             if self._variance == 0.0:
                 self._begin_filter(td_error)
                 information = self._information
-            gradient = replayed.gradient * self._step.scale
+            gradient = gradient * self._step.scale
             limit = settings.innovation_clip * self._variance**0.5
             innovation = np.clip(td_error, -limit, limit)
             told = gradient.T @ gradient / self._variance
@@ -111,7 +110,8 @@ class BatchQLearning(ValueRule):
             slope = gradient.T @ innovation / self._variance
             slope -= self._information @ (self._present - self._mean)
             fit = Fit(slope, cho_solve(cho_factor(information), slope), information.copy)
-            share = 1.0 / max(float(np.abs(fit.minimiser).max()) / settings.longest, 1.0)
+            longest = settings.largest_step or np.inf
+            share = 1.0 / max(float(np.abs(fit.minimiser).max()) / longest, 1.0)
             information = self._information + share * told
             fit = self._average_cost.take(fit.shrunk(share))
             update = self._step.take(fit, float(np.sqrt(np.mean(td_error**2))))
@@ -136,21 +136,6 @@ class BatchQLearning(ValueRule):
         start = self._begin(rows["s"], rows["error"], self._variance**0.5)
         self.controller.theta = start.theta
         self._anchor = start.theta.copy()
-
-
-@dataclass(frozen=True)
-class Replayed:
-    """K transitions at one θ: `action_value` Q(s, a), `target` ℓ + γV(s₊), both (K,).
-
-    `rows` are their indices in the buffer; `gradient` ∇Q (K, n_θ) is unscaled. Transitions whose QP
-    failed at this θ are left out; `failures` counts them.
-    """
-
-    rows: NDArray[np.int64]
-    action_value: Vector
-    target: Vector
-    gradient: Matrix
-    failures: int
 
 
 class ReplayBuffer:
@@ -205,27 +190,21 @@ class ReplayBuffer:
             self._action_value[row] = transition.policy.value
             self._gradient[row] = transition.policy.value_gradient
 
-    def replay(self, average_cost: AverageCost) -> Replayed:
-        """Q(s, a) and V(s₊) of every transition at the controller's θ, in time's order."""
+    def replay(self) -> tuple[NDArray[np.bool_], Vector, Vector, Matrix]:
+        """Q(s, a), V(s₊) and ∇Q (unscaled) of every transition at the controller's θ.
+
+        Before them which of the transitions they are of: not of those whose QP failed.
+        """
         self._forget_other_theta()
-        if not self._controller.memoryless:
-            self._action_value[:] = self._next_value[:] = np.nan
-        rows = np.arange(self._count)
-        self._solve(rows[np.isnan(self._action_value[rows] + self._next_value[rows])])
-        target = average_cost.target(self.rows["cost"], self._next_value[rows])
-        kept = np.isfinite(self._action_value[rows]) & np.isfinite(target)
-        rows = rows[kept]
-        return Replayed(
-            rows,
-            self._action_value[rows],
-            target[kept],
-            self._gradient[rows],
-            int(self._count - kept.sum()),
-        )
+        now, after = self._action_value[: self._count], self._next_value[: self._count]
+        self._solve(np.flatnonzero(np.isnan(now + after)))
+        kept = np.isfinite(now) & np.isfinite(after)
+        return kept, now[kept], after[kept], self._gradient[: self._count][kept]
 
     def _forget_other_theta(self) -> None:
         theta = self._controller.theta
-        if theta is not self._theta and not np.array_equal(theta, self._theta):
+        same = theta is self._theta or np.array_equal(theta, self._theta)
+        if not (same and self._controller.memoryless):
             self._action_value[:] = self._next_value[:] = np.nan
         self._theta = theta
 

@@ -67,7 +67,7 @@ def back_off(start: Parameters, scenario: Scenario) -> Parameters:
             except Exception as error:
                 recover(controller, error)
             ended = segment.take(transition, 0.0)
-        segment.answer = segment.told()
+        segment.answer = search.told(segment)
     _found[key] = search.theta
     return _found[key]
 

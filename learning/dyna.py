@@ -64,19 +64,15 @@ class Dyna(QLearning):
         update, data = super().observe(transition), self._data
         data.add(transition)
         since = data.count - data.fitted
-        changed = data.model is not None and since % WINDOWS[0] == 0 and self._changed()
+        judged = data.model is not None and since % WINDOWS[0] == 0
+        changed = judged and data.changed(*data.errors()[2:])
         age = data.count - data.era
         if changed:
-            self._count = 0
+            self._count, self._first = 0, []
             self._average_cost.mean_cost = self.scenario.controller.reference_cost
         if since < max(self.configuration.interval, age // GROWTH) and not changed:
             return update
         return self._imagine(data.fit(), transition.next_s, min(since, age))
-
-    def _changed(self) -> bool:
-        _, _, errors, designs = (data := self._data).errors()
-        known = (w for w in WINDOWS if w <= len(errors))
-        return any(data.changed(errors[-w:], designs[-w:]) for w in known)
 
     def _imagine(self, model: EmpiricalModel, s: Array, since: int) -> Update:
         """Learn from a trajectory of the model from the state s, after so many of the plant."""

@@ -32,7 +32,7 @@ from controllers.theta import Parameters
 from cosim.protocols import Array
 from cosim.simulation import recover
 from learning.algorithm import Transition
-from learning.checkpoint import group, take_up
+from learning.checkpoint import State, take_up
 
 PARAMETER_DEVIATION = 0.15
 """Prior standard deviation of a parameter's error, as a share of its value."""
@@ -47,8 +47,9 @@ EXACT = 1e-6
 ROUNDS, ENOUGH = 6, 2000
 """Fits, each about the parameters and with the residuals' covariance of the one before, and samples
 of which all but the last take no more than twice as many."""
-ALARM = 1e-7
-"""Probability below which the mean error since the last fit speaks of another plant."""
+ALARM, SUSPICION = 1e-7, 1e-4
+"""Probability below which the mean error since the last fit speaks of another plant, alone and
+where the samples are dearer than was promised too."""
 WINDOWS = (15, 60, 240, 960)
 """Latest samples of which that mean is taken, every `WINDOWS[0]` samples."""
 FORETOLD, EVIDENCE = 240, 3.0
@@ -279,27 +280,32 @@ class PlantData:
         predicted, h, errors, designs = (np.concatenate(part) for part in parts)
         return predicted, h, errors, designs
 
-    def changed(self, errors: Array, designs: Array, alarm: float = ALARM) -> bool:
-        """Whether the mean of the latest `errors` (T, K) is improbable, with their designs.
+    def changed(self, errors: Array, designs: Array, suspect: Sequence[int] = ()) -> bool:
+        """Whether the mean of `errors` (T, K), with their designs, is improbable in a window.
 
-        The data of the present plant begin with them then.
+        The data of the present plant begin with that window then. In `suspect` ones less improbable
+        is enough.
         """
         model = self.model
         assert model is not None
         M, K = model.residuals.shape
-        mean, design = errors.mean(axis=0), designs.mean(axis=0)
-        covariance = model.noise / len(errors) + design @ model.covariance @ design.T
-        statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
-        if fdtrc(K, M - K, max(statistic, 0.0)) >= alarm:
-            return False
-        self.era, self._pool = self.count - len(errors), model.residuals[-POOL:]
-        return True
+        for window in WINDOWS:
+            if window > len(errors):
+                break
+            mean, design = errors[-window:].mean(axis=0), designs[-window:].mean(axis=0)
+            covariance = model.noise / window + design @ model.covariance @ design.T
+            statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
+            alarm = SUSPICION if window in suspect else ALARM
+            if fdtrc(K, M - K, max(statistic, 0.0)) < alarm:
+                self.era, self._pool = self.count - window, model.residuals[-POOL:]
+                return True
+        return False
 
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: State) -> None:
         """Take back what a checkpoint has of this."""
         take_up(self, state)
-        if model := group(state, "model "):
-            self.model = EmpiricalModel(self.features, **model)
+        if state["model"] is not None:
+            self.model = EmpiricalModel(self.features, **state["model"])
 
 
 class Rollout:

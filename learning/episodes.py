@@ -5,19 +5,18 @@ A checkpoint keeps what they told; restoring lets the deterministic plan read it
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cosim.protocols import Vector
+from cosim.protocols import Matrix, Vector
 from learning.algorithm import Algorithm, Transition, Update
-from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.checkpoint import State, arrays_of, take_up
 from learning.step import moved
 
-Told = dict[str, NDArray[Any]]
+Told = dict[str, Any]
 
 
 @dataclass(eq=False)
@@ -27,26 +26,38 @@ class Episode:
     On a simulator the plant is reset before them, where `seed` gives its noise, or put back to
     where it was marked (`rewind`), noise included, and marked after them (`mark`). The plan says of
     an answer that it has `refused` to go where that led.
+
+    Kept are `costs`, the samples' shares of J, and of samples at which the controller did not fail
+    `rows` (number, ℓ, p(s₊), s, a, s₊) and what `measure` makes of transition and number.
     """
 
-    KEPT: ClassVar[tuple[str, ...]] = ("length", "done")
+    KEPT: ClassVar[tuple[str, ...]] = ("length", "costs", "rows", "measured")
     theta: Vector
     length: int
     seed: int | None = None
     rewind: bool = False
     mark: bool = False
-    done: int = field(default=0, init=False)
+    measure: Callable[[Transition, int], Matrix | None] | None = None
+    costs: list[float] = field(default_factory=list, init=False)
+    rows: list[list[float]] = field(default_factory=list, init=False)
+    measured: list[Any] = field(default_factory=list, init=False)
     answer: Told = field(default_factory=dict, init=False)
     refused: bool = field(default=False, init=False)
 
     def take(self, transition: Transition | None, cost: float) -> bool:
         """Take a sample, None where the controller failed, and its share of J: was it the last?"""
-        self.done += 1
-        return self.done >= self.length
+        if transition is not None:
+            number, costs = len(self.costs), (transition.stage_cost, transition.next_penalty)
+            arrays = transition.s, transition.a, transition.next_s
+            self.rows.append([number, *costs, *np.concatenate(arrays).tolist()])
+            if self.measure and (measured := self.measure(transition, number)) is not None:
+                self.measured.append(measured.tolist())
+        self.costs.append(cost)
+        return len(self.costs) >= self.length
 
-    def told(self) -> Told:
-        """The answer, when all samples are taken."""
-        raise NotImplementedError
+    def samples(self, columns: int) -> Matrix:
+        """The rows as an array, (K, 3+2n+m)."""
+        return np.array(self.rows).reshape(-1, columns)
 
 
 class Planned(Algorithm):
@@ -76,9 +87,8 @@ class Planned(Algorithm):
         self._begin(next(self._plan, None))
 
     def told(self) -> Told:
-        """What the episode told."""
-        found: Told = self._episode.told()
-        return found
+        """What the episode told, when all its samples are taken."""
+        raise NotImplementedError
 
     @property
     def _seed(self) -> int | None:
@@ -108,21 +118,17 @@ class Planned(Algorithm):
         """Take a sample at which the controller failed, with its share of J."""
         return self.observe(None, cost)
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> State:
         """What the plan was told, the open episode, and `KEPT`."""
-        state = super().state() | {"told": np.array(len(self._history))}
-        for number, told in enumerate(self._history):
-            state |= prefixed(f"told {number} ", told)
-        if self._episode is not None:
-            state |= prefixed("episode ", arrays_of(self._episode))
-        return state
+        state = super().state() | {"told": self._history}
+        return state | {"episode": None if self._episode is None else arrays_of(self._episode)}
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+    def restore(self, state: State) -> None:
         """Restore what `state` returned."""
         theta = self.controller.theta
-        for number in range(int(state["told"])):
-            self._tell(group(state, f"told {number} "))
+        for told in state["told"]:
+            self._tell(told)
         self.controller.theta = theta
         if self._episode is not None:
-            take_up(self._episode, group(state, "episode "))
+            take_up(self._episode, state["episode"])
         super().restore(state)

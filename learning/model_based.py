@@ -25,7 +25,6 @@ from cosim.protocols import Array
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import ALL, Configuration, Count, ModelParameters
 from learning.empirical_model import (
-    ALARM,
     GROWTH,
     WINDOWS,
     EmpiricalModel,
@@ -52,8 +51,6 @@ WORTH = 1e-6
 """Share of the cost that the penalty of a bound must reach for its back-off to be searched."""
 TAIL, TAIL_SAMPLES = 0.1, 120
 """The errors' tails are widened by `TAIL` √(`TAIL_SAMPLES` / their number)."""
-SUSPICION = 1e-4
-"""Probability of the mean error that speaks of another plant where the promise is broken too."""
 SETTLING = 30
 """Samples after an update that do not break its promise, which is of a loop that has settled."""
 BROKEN = 1.5
@@ -142,21 +139,18 @@ class ModelBased(Algorithm):
 
     def _alarmed(self, model: EmpiricalModel) -> bool:
         """Whether the promise is broken or, on new data, the plant is another."""
-        data, alarmed = self._data, False
-        since = data.count - data.fitted
+        data = self._data
         if len(model.residuals) < CAUTION:
             return False
         predicted, h, errors, designs = data.errors()
         costs = ExpectedCosts(self._problem, model)(predicted, h)[0]
-        for window, limit in zip(WINDOWS, self._limits, strict=True):
-            if window > since:
-                break
-            broken = since > SETTLING and costs[-window:].mean() > limit
-            alarm = SUSPICION if broken else ALARM
-            if data.changed(errors[-window:], designs[-window:], alarm):
-                return True
-            alarmed |= broken
-        return alarmed
+        settled = len(costs) > SETTLING
+        broken = [
+            window
+            for window, limit in zip(WINDOWS, self._limits, strict=True)
+            if settled and window <= len(costs) and costs[-window:].mean() > limit
+        ]
+        return data.changed(errors, designs, broken) or bool(broken)
 
     def _least(self, present: Array, inputs: Array) -> Array:
         """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -78,24 +77,6 @@ class Coordinates:
         return start.replace(values)
 
 
-@dataclass(eq=False)
-class Candidate(Episode):
-    """A stretch that judges a θ: its `cost` is summed once it has taken `settling` samples."""
-
-    KEPT = (*Episode.KEPT, "cost")
-    settling: int = 0
-    cost: float = field(default=0.0, init=False)
-
-    def take(self, transition: Transition | None, cost: float) -> bool:
-        """Count a sample's cost."""
-        self.cost += cost if self.done >= self.settling else 0.0
-        return super().take(transition, cost)
-
-    def told(self) -> Told:
-        """The mean cost."""
-        return {"cost": np.array(self.cost / (self.length - self.settling))}
-
-
 class PolicySearch(Planned):
     """CMA-ES (Hansen) on the mean cost of stretches of operation, one for each candidate.
 
@@ -111,9 +92,11 @@ class PolicySearch(Planned):
         start, width = self.controller.parameters, self.configuration.width
         self._coordinates = Coordinates(start, self.scenario, width)
         self.theta = self._coordinates.theta(np.zeros(self._coordinates.size)).theta
+        settling = min(self.scenario.controller.horizon, self.configuration.episode - 1)
+        self._settling = 0 if self.asks_for == "simulator" else settling
         self.follow(self._generations())
 
-    def _generations(self) -> Iterator[Candidate]:
+    def _generations(self) -> Iterator[Episode]:
         settings, count = self.configuration, self.configuration.population
         search = CMA(
             mean=np.zeros(self._coordinates.size),
@@ -121,18 +104,21 @@ class PolicySearch(Planned):
             population_size=count,
             seed=int(self.rng.integers(2**31)),
         )
-        settling = min(self.scenario.controller.horizon, settings.episode - 1)
-        settling = 0 if self.asks_for == "simulator" else settling
         while True:
             population = [search.ask() for _ in range(count)]
             noise, judged = int(self.rng.integers(2**63)), []
             for z in population:
                 theta = self._coordinates.theta(z).theta
-                yield (stretch := Candidate(theta, settings.episode, noise, settling=settling))
-                judged.append((z, float(stretch.answer["cost"])))
+                yield (stretch := Episode(theta, settings.episode, noise))
+                judged.append((z, stretch.answer["cost"]))
             search.tell(judged)
             # θ at the mean of the search distribution.
             self.theta = self._coordinates.theta(search.mean).theta
+
+    def told(self) -> Told:
+        """Mean cost of the stretch once it has settled."""
+        costs = self._episode.costs[self._settling :]
+        return {"cost": float(np.cumsum(costs)[-1]) / len(costs)}
 
     def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
         """Count a sample's cost; the step of θ is that of the mean."""

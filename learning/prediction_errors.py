@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import casadi as ca
 import numpy as np
 
+from controllers.economic import linear_model
 from controllers.functions import StackedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
@@ -27,14 +26,12 @@ class OneStepModel:
 
     def __init__(self, scenario: Scenario) -> None:
         problem = Problem.from_scenario(scenario)
-        self.states = problem.n_states
+        self.states, self.inputs = problem.n_states, problem.n_states + problem.n_actions
         model = problem.model
         step = discretise(model, problem.sampling_time, problem.substeps)
         x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
         d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
-        next_state = step(x, u, d, p)
-        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": next_state})
-        self._transition = ca.Function("A", [x, u], [ca.jacobian(next_state, x)])
+        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": step(x, u, d, p)})
         self._problem, self._model = problem, model
         free = ca.SX.sym("p", len(model.parameters))
         given = {"x": x, "u": u, "p": free}
@@ -49,8 +46,7 @@ class OneStepModel:
 
     def slowest(self) -> float:
         """Samples of f's slowest time constant at the reference, `SLOWEST` at most."""
-        transition = self._transition(self._problem.reference_state, self._problem.reference_action)
-        largest = np.abs(np.linalg.eigvals(transition.full())).max()
+        largest = np.abs(np.linalg.eigvals(linear_model(self._problem)[0])).max()
         return float(1.0 / max(1.0 - largest, 1.0 / SLOWEST))
 
     def parameters(self, theta: Parameters) -> Vector:
@@ -89,14 +85,10 @@ def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
 class SortedErrors:
     """Errors (M, n), of each state in ascending order, for means beyond a threshold."""
 
-    KEPT = ("errors",)
+    KEPT = ("errors", "_sum", "_squares")
 
     def __init__(self, errors: Matrix) -> None:
-        self.restore({"errors": errors})
-
-    def restore(self, state: Mapping[str, Matrix]) -> None:
-        """Take other errors."""
-        self.errors = np.sort(state["errors"], axis=0)
+        self.errors = np.sort(errors, axis=0)
         zero = np.zeros((1, self.errors.shape[1]))
         self._sum = np.concatenate([zero, np.cumsum(self.errors, axis=0)])
         self._squares = np.concatenate([zero, np.cumsum(self.errors**2, axis=0)])
@@ -139,23 +131,23 @@ class PredictionErrors:
     s and a. It needs plant data alone, and the errors include those of the model.
     """
 
-    KEPT = ("_errors", "_count")
+    KEPT = ("_errors", "count")
 
     def __init__(self, scenario: Scenario, capacity: int) -> None:
         self._penalty = scenario.state_penalty
         # A row a state: NumPy is three times as fast along the errors as along a few states.
         self._errors = np.zeros((scenario.state_lower.size, capacity))
-        self._count = 0
+        self.count = 0
 
     @property
     def values(self) -> Matrix:
         """The errors kept, (K, n), in no order."""
-        return self._errors[:, : self._count].T
+        return self._errors[:, : self.count].T
 
     def add(self, error: Vector) -> None:
         """Keep an error (n,) in place of the oldest one."""
-        self._errors[:, self._count % self._errors.shape[1]] = error
-        self._count += 1
+        self._errors[:, self.count % self._errors.shape[1]] = error
+        self.count += 1
 
     def expected_penalty(self, prediction: Vector) -> float:
         """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""

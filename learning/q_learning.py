@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
@@ -12,6 +12,7 @@ from pydantic import Field
 
 from controllers.theta import Parameters
 from cosim.protocols import Matrix, Vector
+from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import (
     Configuration,
@@ -63,20 +64,12 @@ class ValueConfiguration(Configuration):
         1.0, description="prior deviations by which a step may move an entry of θ; 0: no limit"
     )
 
-    @property
-    def criterion(self) -> float | None:
-        """Discount of the TD error, None for the scenario's."""
-        return 1.0 if self.discount is None else self.discount
+    def criterion(self, scenario: Scenario) -> tuple[float, float]:
+        """Discount of the TD error, and time constants over which the mean cost follows δ.
 
-    @property
-    def following(self) -> float:
-        """Time constants over which the mean cost follows δ; 0: fitted with θ."""
-        return 0.0
-
-    @property
-    def longest(self) -> float:
-        """Prior deviations by which a step may move an entry of θ."""
-        return self.largest_step or np.inf
+        With 0 the mean cost is fitted with θ.
+        """
+        return self.discount or 1.0, 0.0
 
     def narrowed(self, width: float) -> Self:
         """Copy whose prior is `width` times as wide."""
@@ -111,15 +104,11 @@ class QLearningConfiguration(ValueConfiguration):
         True, description="rules td and fit: step in coordinates θ/scale, else in θ itself"
     )
 
-    @property
-    def criterion(self) -> float | None:
-        """Discount of the TD error, None for the scenario's."""
-        return super().criterion if self.rule == "kalman" else self.discount
-
-    @property
-    def following(self) -> float:
-        """Time constants over which the mean cost follows δ; 0: fitted with θ."""
-        return self.mean_cost_memory if self.rule == "kalman" else 0.0
+    def criterion(self, scenario: Scenario) -> tuple[float, float]:
+        """As without this; δ of the rules td and fit has the scenario's discount."""
+        if self.rule != "kalman":
+            return self.discount or scenario.discount, 0.0
+        return self.discount or 1.0, self.mean_cost_memory
 
     def without_part(self) -> Mapping[str, str]:
         """Hyperparameters of other rules than the chosen one."""
@@ -135,29 +124,22 @@ class QLearningConfiguration(ValueConfiguration):
 class ValueRule(Algorithm):
     """Common part of online and batch Q-learning: prediction errors, a mean cost, coordinates."""
 
-    # The scale comes first: setting it makes step and mean cost, which are restored after it.
-    KEPT: ClassVar[tuple[str, ...]] = ("scale", "_step", "_average_cost", "_errors")
+    KEPT: ClassVar[tuple[str, ...]] = ("_step", "_average_cost", "_errors")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
         self._errors = PredictionErrors(self.scenario, self.configuration.prediction_errors)
-        self.scale = np.ones(self.controller.theta.size)
+        self._measure_in(np.ones(self.controller.theta.size))
 
-    @property
-    def scale(self) -> Vector:
-        """Scale of each entry of θ in the steps' coordinates, (n_θ,)."""
-        return self._step.scale
-
-    @scale.setter
-    def scale(self, scale: Vector) -> None:
-        settings = self.configuration
-        self._step = ConstrainedStep(self.controller, settings, scale)
-        discount = self.scenario.discount if settings.criterion is None else settings.criterion
-        position, cost = self._step.blocks.slices["c_lambda"].start, self.scenario.controller
-        level = float(self._step.scale[position])
-        memory = round(settings.following * self._model.slowest())
-        self._average_cost = AverageCost(discount, position, level, cost.reference_cost, memory)
+    def _measure_in(self, scale: Vector) -> None:
+        """Begin anew with this scale of each entry of θ in the steps' coordinates, (n_θ,)."""
+        self._step = ConstrainedStep(self.controller, self.configuration, scale)
+        discount, constants = self.configuration.criterion(self.scenario)
+        position = self._step.blocks.slices["c_lambda"].start
+        level, cost = float(scale[position]), self.scenario.controller.reference_cost
+        memory = round(constants * self._model.slowest())
+        self._average_cost = AverageCost(discount, position, level, cost, memory)
 
     def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
         """The prior's mean; its deviations become the coordinates.
@@ -168,14 +150,9 @@ class ValueRule(Algorithm):
         settings, start = self.configuration, self.controller.parameters
         if settings.measure_offset:
             start = start.replace({"c_f": errors.mean(axis=0)})
-        self.scale = prior_deviation(
-            start,
-            states.std(axis=0),
-            errors.std(axis=0),
-            self.strategy.deviation,
-            max(abs(float(start["c_lambda"])), noise),
-            settings.prior_width,
-        )
+        level, action = max(abs(float(start["c_lambda"])), noise), self.strategy.deviation
+        s, e = states.std(axis=0), errors.std(axis=0)
+        self._measure_in(prior_deviation(start, s, e, action, level, settings.prior_width))
         return start
 
 
@@ -201,15 +178,10 @@ class QLearning(ValueRule):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        settings, n = self.configuration, self.scenario.state_lower.size
+        settings = self.configuration
         if settings.rule != "kalman" and settings.scaled:
-            self.scale = self.controller.parameters.blocks.scale
-        rows = settings.prior_samples
-        self._first = {
-            "states": np.zeros((rows, n)),
-            "prediction_errors": np.zeros((rows, n)),
-            "td_errors": np.zeros(rows),
-        }
+            self._measure_in(self.controller.parameters.blocks.scale)
+        self._first: list[list[float]] = []  # rows (s, e, δ)
         self._regression = self._filter(1.0)
         self._count = 0
         self._squares = 0.0
@@ -226,11 +198,10 @@ class QLearning(ValueRule):
         solution = transition.action_value
         td_error = self._average_cost.target(transition.cost, value) - solution.value
         self._average_cost.follow(td_error)
-        first, count, self._count = self._first, self._count, self._count + 1
-        if count < len(first["states"]):
-            first["states"][count], first["prediction_errors"][count] = transition.s, error
-            first["td_errors"][count] = td_error
-            return self._begin_filter() if self._count == len(first["states"]) else None
+        self._count += 1
+        if (left := self.configuration.prior_samples - self._count) >= 0:
+            self._first.append([*transition.s.tolist(), *error.tolist(), td_error])
+            return None if left else self._begin_filter()
         gradient = self._average_cost.fitted(solution.value_gradient * self._step.scale)
         innovation = self._regression.update(td_error, gradient)
         self._squares += innovation * innovation
@@ -243,25 +214,20 @@ class QLearning(ValueRule):
 
     def _begin_filter(self) -> Update:
         """Take the noise, the widths and c_f from the first samples."""
-        first = self._first
-        variance = float(np.mean(first["td_errors"] ** 2))
+        first, n = np.array(self._first), self._model.states
+        self._first.clear()
+        variance = float(np.mean(first[:, -1] ** 2))
         if not np.isfinite(variance):
             raise DivergenceError("TD errors are not finite")
-        start = self._begin(first["states"], first["prediction_errors"], variance**0.5)
+        start = self._begin(first[:, :n], first[:, n:-1], variance**0.5)
         self._regression = self._filter(max(variance, np.finfo(np.float64).tiny))
         return self._step.move(start.theta, variance**0.5)
 
     def _filter(self, variance: float) -> KalmanRegression:
-        settings, size = self.configuration, self.scale.size
-        return KalmanRegression(
-            np.zeros(size),
-            np.eye(size),
-            variance,
-            settings.innovation_clip,
-            settings.variance_memory,
-            settings.parameter_drift,
-            settings.longest,
-        )
+        settings, largest = self.configuration, self.configuration.largest_step or np.inf
+        clip, memory = settings.innovation_clip, settings.variance_memory
+        drift = settings.parameter_drift
+        return KalmanRegression(self._step.scale.size, variance, clip, memory, drift, largest)
 
     def _sample_step(self, transition: Transition) -> Update:
         settings = self.configuration
@@ -284,18 +250,19 @@ class KalmanRegression:
     samples. `drift` is added to P's diagonal at each sample. A step has no entry beyond ±`largest`.
     """
 
-    mean: Vector
-    covariance: Matrix
+    KEPT: ClassVar = ("mean", "covariance", "variance", "before")
+    size: int
     variance: float
     clip: float
     memory: float
     drift: float = 0.0
     largest: float = np.inf
-    before: Matrix = field(init=False)
-    """P at the last step."""
 
     def __post_init__(self) -> None:
+        self.mean: Vector = np.zeros(self.size)
+        self.covariance: Matrix = np.eye(self.size)
         self.before = self.covariance.copy()
+        """P at the last step."""
 
     def update(self, td_error: float, gradient: Vector) -> float:
         """Take δ and ∇Q (n,), scaled; returns the innovation δ − ∇Qᵀd."""
@@ -338,7 +305,7 @@ class AverageCost:
     θ; `start` is the first guess of g.
     """
 
-    KEPT = ("mean_cost",)
+    KEPT = ("mean_cost", "_scale")
 
     def __init__(
         self, discount: float, position: int, scale: float, start: float, memory: int = 0

@@ -23,7 +23,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.batch_q_learning import BatchQLearning
 from learning.configuration import Configuration, Count
 from learning.episodes import Episode, Planned, Told
-from learning.errors import ConfigurationError, DivergenceError
+from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel, SortedErrors, expected_penalties
 from learning.q_learning import QLearning
 from learning.step import clip_eigenvalues, prior_deviation, smallest_eigenvalue
@@ -58,59 +58,14 @@ class Trial(Episode):
     """θ (n_θ,) runs greedily for a stretch, or is where the rule `learns` from.
 
     The rule goes on with its data, or with a `width` begins anew, its prior or trust region so many
-    times as wide. With the exploration's σ as `deviation` (m,) a stretch tells dπ/dθ too.
+    times as wide; it leaves `candidates` (n_θ,), the last one where it ended. What a stretch may
+    `measure` is dπ/dθ, in the exploration's σ, (m, n_θ).
     """
 
-    KEPT = (*Episode.KEPT, "rows", "candidates", "stage_cost", "penalty", "metric", "jacobians")
+    KEPT = (*Episode.KEPT, "candidates")
     learns: bool = False
     width: float | None = None
-    deviation: Vector | None = None
-
-    def __post_init__(self) -> None:
-        self.rows: list[Vector] = []
-        self.candidates: list[Vector] = []
-        self.stage_cost, self.penalty, self.jacobians = 0.0, 0.0, 0
-        self.metric: Matrix = np.zeros((0 if self.deviation is None else self.theta.size,) * 2)
-
-    def take(self, transition: Transition | None, cost: float) -> bool:
-        """Take a sample; one at which the controller failed has its share of J alone."""
-        if transition is None:
-            self.stage_cost += cost
-            return super().take(transition, cost)
-        self.rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
-        self.stage_cost += transition.stage_cost
-        self.penalty += transition.next_penalty
-        if self.deviation is not None and self.done % max(self.length // SENSITIVITIES, 1) == 0:
-            jacobian = transition.policy.policy_jacobian / self.deviation[:, None]
-            if np.isfinite(jacobian).all():
-                self.metric += jacobian.T @ jacobian
-                self.jacobians += 1
-        return super().take(transition, cost)
-
-    def predicted(self, model: OneStepModel) -> Told:
-        """What the trial told, with predictions by the controller's own `model`.
-
-        Prediction `errors` s₊ − f(s, a), (K, n). Of learning `candidates` (C, n_θ), the last one
-        where it ended, and `deviations` (2, n) of states and errors. Of a stretch its `cost`, means
-        of stage cost and penalty per sample (2,), its `predictions` f(s, a) (K, n), and `metric`
-        E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ), with Σ = diag σ².
-        """
-        n = model.states
-        kept = self.rows[-LATEST:] if self.learns else self.rows
-        rows = np.array(kept) if kept else np.zeros((0, 2 * n))
-        predictions = np.array([model(row[:n], row[n:-n]) for row in rows]).reshape(-1, n)
-        states, errors = rows[:, :n], rows[:, -n:] - predictions
-        if self.learns:
-            if not kept:
-                states, errors = np.zeros((2, 1, n))
-            candidates = np.array(self.candidates).reshape(-1, self.theta.size)
-            deviations = np.array([states.std(axis=0), errors.std(axis=0)])
-            return {"errors": errors, "candidates": candidates, "deviations": deviations}
-        told = {"cost": np.array([self.stage_cost, self.penalty]) / self.length}
-        told |= {"errors": errors, "predictions": predictions}
-        if self.deviation is not None:
-            told["metric"] = self.metric / max(self.jacobians, 1)
-        return told
+    candidates: list[Vector] = field(default_factory=list, init=False)
 
 
 Plan = Generator[Trial, None, None]
@@ -121,22 +76,15 @@ class Spent(Exception):
     """The samples are used up."""
 
 
-@dataclass
 class Candidate:
-    """A θ with the mean costs of its stretches: `realised`, and `expected` with pooled errors."""
+    """A θ with the mean `costs` of its stretches so far, of two readings the larger.
 
-    theta: Vector
-    realised: list[float] = field(default_factory=list)
-    expected: list[float] = field(default_factory=list)
+    The realised penalty is rare spikes. The expected one, with pooled errors, is too large where
+    the errors depend on the state, by 10 to 20 a sample near the best back-off of `paper`.
+    """
 
-    @property
-    def costs(self) -> Vector:
-        """The larger of both readings, stretch by stretch.
-
-        The realised penalty is rare spikes. The expected one is too large where the errors depend
-        on the state, by 10 to 20 a sample near the best back-off of `paper`.
-        """
-        return np.maximum(self.realised, self.expected)
+    def __init__(self, theta: Vector) -> None:
+        self.theta, self.costs = theta, np.zeros(0)
 
 
 def cheaper(difference: Vector) -> bool:
@@ -282,7 +230,7 @@ class SearchPlan:
     def _along(self, direction: Vector, reach: float) -> Generator[Trial, None, float]:
         """Line search both ways in scaled θ, (n_θ,); returns the first step of the next time."""
         longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
-        origin, quarter = self.base.theta, max(len(self.base.realised) // 4, 1)
+        origin, quarter = self.base.theta, max(len(self.base.costs) // 4, 1)
         for sign in (1.0, -1.0):
             # Steps that win over a quarter of the stretches are doubled; the longest runs all.
             step, best, costs = sign * min(reach, longest), 0.0, self.base.costs[:quarter]
@@ -308,8 +256,13 @@ class SearchPlan:
 
     def _directions(self, *, turned: bool) -> Generator[Trial, None, Matrix]:
         """Directions in scaled θ that change the policy by the exploration's σ, (n_θ, K)."""
-        deviation = self._action_deviation
-        trial = Trial(self.base.theta, self.stretch, rewind=True, deviation=deviation)
+
+        def sensitivity(transition: Transition, number: int) -> Matrix | None:
+            if number % max(self.stretch // SENSITIVITIES, 1):
+                return None
+            return transition.policy.policy_jacobian / self._action_deviation[:, None]
+
+        trial = Trial(self.base.theta, self.stretch, rewind=True, measure=sensitivity)
         told, _, _ = yield from self._ask(trial)
         values, vectors = np.linalg.eigh(told["metric"] * np.outer(self._scale, self._scale))
         values, vectors = values[::-1][: self.DIRECTIONS], vectors[:, ::-1][:, : self.DIRECTIONS]
@@ -364,16 +317,16 @@ class SearchPlan:
 
     def _run(self, candidate: Candidate) -> Plan:
         """One more stretch of a candidate, always on from its last one."""
-        trial = Trial(candidate.theta, self.stretch, rewind=not candidate.realised)
+        trial = Trial(candidate.theta, self.stretch, rewind=not len(candidate.costs))
         told, predictions, errors = yield from self._ask(trial)
         cost, penalty = map(float, told["cost"])
         if "expected" not in told:
-            told["expected"] = np.array(penalty)  # where there is no pool yet
+            told["expected"] = penalty  # where there is no pool yet
             if len(predictions) and len(self._pool.errors):
                 due = expected_penalties(self._penalty, predictions, self._pool)
-                told["expected"] = np.array(due.mean(axis=-1).cumsum()[-1])
-        candidate.realised.append(cost + penalty)
-        candidate.expected.append(cost + float(told["expected"]))
+                told["expected"] = float(due.mean(axis=-1).cumsum()[-1])
+        larger = np.maximum(cost + penalty, cost + told["expected"])
+        candidate.costs = np.append(candidate.costs, larger)
         self._remember(errors)
 
     def renew(self, stretches: int, seed: int | None = None) -> Plan:
@@ -453,15 +406,12 @@ class SearchPlan:
 
 
 class SearchConfiguration(Configuration):
-    """Settings of the search; those of its rule are the table `rule_settings`."""
+    """Settings of the search; its rule has its own defaults but for `RULE_DEFAULTS`."""
 
     rule: Literal["none", "q-learning", "batch-q-learning", "actor-critic"] = Field(
         "none",
         description="what learns in the phases between the comparisons; none: θ rests in them, and "
         "they last stretches × stretch samples",
-    )
-    rule_settings: dict[str, Any] = Field(
-        {}, description="the rule's own settings, as rule_settings = {prior_width = 0.1}"
     )
     q_learning_first: bool = Field(
         False,
@@ -473,34 +423,26 @@ class SearchConfiguration(Configuration):
     stretches: Count = Field(8, description="stretches of a comparison that is not decided before")
 
     def rule_configuration(self, name: str) -> Any:
-        """Settings of a rule in the search: those that they share, and the rule's own."""
+        """Settings of a rule in the search: those that they share, and `RULE_DEFAULTS`."""
         shared = {field: getattr(self, field) for field in Configuration.model_fields}
-        own = self.rule_settings if name == self.rule else {}
         rule = RULES[name].Configuration
-        shared |= {key: value for key, value in RULE_DEFAULTS.items() if key in rule.model_fields}
+        own = {key: value for key, value in RULE_DEFAULTS.items() if key in rule.model_fields}
         return rule.from_dict(shared | own)
 
     def without_part(self) -> Mapping[str, str]:
         """Settings without effect in a search without a rule."""
-        names = ("phase", "rule_settings", "q_learning_first") if self.rule == "none" else ()
+        names = ("phase", "q_learning_first") if self.rule == "none" else ()
         return dict.fromkeys(names, "a search without a rule")
 
     @model_validator(mode="after")
     def _take_over_from_the_rule(self) -> Self:
-        """Explore as the rule would, unless told otherwise; refuse settings that it lacks."""
-        if shared := sorted(self.rule_settings.keys() & Configuration.model_fields.keys()):
-            raise ValueError(f"rule_settings: {shared[0]} is a setting of the search itself")
+        """Explore as the rule would, unless told otherwise."""
         rule = "q-learning" if self.rule == "none" else self.rule
         fields = RULES[rule].Configuration.model_fields
         for name in ("exploration_probability", "exploration_share"):
             if name not in self.model_fields_set:
                 # Not by `setattr`: it is still a default, which a scenario may replace.
                 self.__dict__[name] = fields[name].default
-        if self.rule != "none":
-            try:
-                self.rule_configuration(self.rule)
-            except ConfigurationError as error:
-                raise ValueError(f"rule_settings: {error}") from None
         return self
 
 
@@ -565,9 +507,33 @@ class Search(Planned):
         self.needs_points = rule is not None and rule.needs_points
 
     def told(self) -> Told:
-        """What the trial told, predictions included."""
-        trial: Trial = self._episode
-        return trial.predicted(self._model)
+        """What the trial told, with predictions by the controller's own model.
+
+        Prediction `errors` s₊ − f(s, a), (K, n). Of learning `candidates` and `deviations` (2, n)
+        of states and errors. Of a stretch its `cost`, means of stage cost and penalty per sample
+        (2,), its `predictions` f(s, a) (K, n), and `metric` E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ), Σ = diag σ².
+        """
+        trial, model, n = self._episode, self._model, self._model.states
+        rows = trial.samples(3 + model.inputs + n)
+        costs, rows = np.array(trial.costs), rows[-LATEST:] if trial.learns else rows
+        predictions = np.array([model(row[3 : 3 + n], row[3 + n : -n]) for row in rows])
+        predictions = predictions.reshape(-1, n)
+        states, errors = rows[:, 3 : 3 + n], rows[:, -n:] - predictions
+        if trial.learns:
+            if not len(rows):
+                states, errors = np.zeros((2, 1, n))
+            deviations = np.array([states.std(axis=0), errors.std(axis=0)])
+            return {"errors": errors, "candidates": trial.candidates, "deviations": deviations}
+        # A sample at which the controller failed has its share of J alone.
+        costs[rows[:, 0].astype(int)] = rows[:, 1]
+        total = costs.cumsum()[-1], np.append(0.0, rows[:, 2]).cumsum()[-1]
+        told = {"cost": np.array(total) / trial.length}
+        told |= {"errors": errors, "predictions": predictions}
+        if trial.measure is not None:
+            jacobians = [J for J in map(np.array, trial.measured) if np.isfinite(J).all()]
+            metric = sum((J.T @ J for J in jacobians), np.zeros((trial.theta.size,) * 2))
+            told["metric"] = metric / max(len(jacobians), 1)
+        return told
 
     def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
         """Take one sample, of which the rule learns in a phase of learning."""
@@ -577,9 +543,9 @@ class Search(Planned):
                 # A new rule counts from 0: its schedules begin anew.
                 update = self._rule.observe(transition._replace(number=self._learnt))
                 self._learnt += 1
-                if (trial.done + 1) % max(trial.length // CANDIDATES, 1) == 0:
+                if (len(trial.costs) + 1) % max(trial.length // CANDIDATES, 1) == 0:
                     trial.candidates.append(self.controller.theta.copy())
             except DivergenceError:
                 # The phase ends here; its earlier candidates may still be good.
-                trial.length = trial.done + 1
+                trial.length = len(trial.costs) + 1
         return super().observe(transition, cost) or update

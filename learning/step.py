@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import clarabel
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from controllers.economic import solve_conic, svec_order
@@ -100,18 +100,6 @@ def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix) -> F
     return Fit(half, minimiser, lambda: metric / step_size)
 
 
-class Outcome(NamedTuple):
-    """Result of a step: the `smallest` eigenvalue of B_l and B_Vf after it.
-
-    `corrected`: the free step would have violated the constraint; `refused`: no admissible step was
-    found and θ stays.
-    """
-
-    smallest: float
-    corrected: bool = False
-    refused: bool = False
-
-
 def smallest_eigenvalue(blocks: ThetaBlocks, theta: Vector) -> float:
     """Least eigenvalue of B_l and B_Vf at θ, in their own units."""
     least = [np.linalg.eigvalsh(matrix_of(blocks, theta, name))[0] for name in HESSIANS]
@@ -126,18 +114,14 @@ def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
 
 def definite(
     blocks: ThetaBlocks, theta: Vector, fit: Fit, smallest: float, scale: Vector | None = None
-) -> tuple[Vector, Outcome]:
-    """The fit's own minimiser under B ⪰ εI, by Clarabel where the free minimiser violates it.
+) -> Vector | None:
+    """θ at the fit's own minimiser under B ⪰ εI, by Clarabel; None where the solver fails.
 
     min dᵀMd − 2bᵀd  s.t.  B_l(θ+Sd) ⪰ εI, B_Vf(θ+Sd) ⪰ εI with scaled steps d (S = diag scale):
     a quadratic programme over positive semidefinite cones (paper.tex, eq. q_solution, pg_solution).
     S is `scale` (n_θ,), the layout's if not given; the matrices have their own units in any case.
-    Returns the new θ; a failure of the solver refuses the step.
     """
     scale = blocks.scale if scale is None else scale
-    free = theta + scale * fit.minimiser
-    if (found := smallest_eigenvalue(blocks, free)) >= smallest:
-        return free, Outcome(found)
     matrices, offsets, cones = [], [], []
     for name in HESSIANS:
         block, where = blocks.block(name), blocks.slices[name]
@@ -159,11 +143,8 @@ def definite(
         np.concatenate(offsets),
         cones,
     )
-    if step is None:
-        return theta, Outcome(smallest_eigenvalue(blocks, theta), corrected=True, refused=True)
     # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
-    theta = clip_eigenvalues(blocks, theta + scale * step, smallest)
-    return theta, Outcome(smallest_eigenvalue(blocks, theta), corrected=True)
+    return None if step is None else clip_eigenvalues(blocks, theta + scale * step, smallest)
 
 
 def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vector:
@@ -185,11 +166,10 @@ class ConstrainedStep:
     """Moves a controller's θ by a fit under every constraint on θ.
 
     `scale` (n_θ,) are the coordinates of the fits, the layout's if not given. The Hessians' least
-    eigenvalue is the configuration's, or half of the start's where that is less. Raises
-    DivergenceError on a step that is not finite.
+    eigenvalue is the configuration's, or half of the start's where that is less.
     """
 
-    KEPT = ("_smallest",)
+    KEPT = ("scale", "_smallest")
 
     def __init__(
         self, controller: RtiNmpc, configuration: Configuration, scale: Vector | None = None
@@ -202,38 +182,35 @@ class ConstrainedStep:
         self._smallest = min(least, own / 2) if own > 0 else least
         self._least = {block.name: np.array(block.least) for block in self.blocks if block.least}
 
-    def proposal(self, fit: Fit) -> tuple[Vector, Outcome]:
-        """The new θ of a fit, and its outcome; the controller's θ stays.
+    def take(self, fit: Fit, td_error: float) -> Update:
+        """Set the controller's θ to the fit's; the update.
 
         A step that definiteness corrects beyond the fit's cap or trust region is scaled back: the θ
-        with definite Hessians are a convex set. Raises DivergenceError on a step not finite.
+        with definite Hessians are a convex set. θ stays where Clarabel fails or bounds would cross.
+        Raises DivergenceError on a step that is not finite.
         """
-        theta = self._controller.theta
+        blocks, slices, theta = self.blocks, self.blocks.slices, self._controller.theta
         if not np.isfinite(fit.minimiser).all():
             raise DivergenceError("the step of θ is not finite")
-        new, outcome = definite(self.blocks, theta, fit, self._smallest, self.scale)
-        new = new.copy()
+        free = theta + self.scale * fit.minimiser
+        least = smallest_eigenvalue(blocks, free)
+        corrected = least < self._smallest
+        found = definite(blocks, theta, fit, self._smallest, self.scale) if corrected else free
+        new = (theta if found is None else found).copy()
         for name, minimum in self._least.items():
-            where = self.blocks.slices[name]
             # Least slack weights: exact (linear) and convex (quadratic).
-            new[where] = np.maximum(new[where], minimum)
+            new[slices[name]] = np.maximum(new[slices[name]], minimum)
         reach = 0.0 if fit.reach is None else fit.reach((new - theta) / self.scale)
         if reach > 1.0:
             new = theta + (new - theta) / reach
-            outcome = outcome._replace(smallest=smallest_eigenvalue(self.blocks, new))
-        lower, upper = self.blocks.slices["x_l"], self.blocks.slices["x_u"]
-        if not (new[lower] < new[upper]).all():
-            kept = smallest_eigenvalue(self.blocks, theta)
-            return theta, Outcome(kept, corrected=True, refused=True)
-        return new, outcome
-
-    def take(self, fit: Fit, td_error: float) -> Update:
-        """Set the controller's θ to the fit's proposal; the update."""
-        old = self._controller.theta
-        new, outcome = self.proposal(fit)
+        refused = found is None or not (new[slices["x_l"]] < new[slices["x_u"]]).all()
+        if refused:
+            new, corrected = theta, True
+        if not np.array_equal(new, free):
+            least = smallest_eigenvalue(blocks, new)
         self._controller.theta = new
-        size = float(np.linalg.norm((new - old) / self.scale))
-        return Update(td_error, size, *outcome)
+        size = float(np.linalg.norm((new - theta) / self.scale))
+        return Update(td_error, size, least, corrected, bool(refused))
 
     def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
         """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), scaled."""
@@ -271,13 +248,13 @@ def prior_deviation(
     initial = np.maximum(terminal, np.sqrt(np.abs(np.diag(start["B_lambda"]))))
     dearest = float((stage * move).max())
     bound = BACK_OFF * width / 0.3 * np.maximum(error_deviation, SLOW * state_deviation)
-    widths = {
-        "B_lambda": width * _packed(initial),
+    widths: dict[str, ArrayLike] = {
+        "B_lambda": width * np.outer(initial, initial),
         "b_lambda": width * np.maximum(terminal * dearest, np.abs(start["b_lambda"])),
-        "c_lambda": np.array([LEVEL * abs(level)]),
-        "B_Vf": width * _packed(terminal),
+        "c_lambda": LEVEL * abs(level),
+        "B_Vf": width * np.outer(terminal, terminal),
         "b_Vf": width * np.maximum(terminal * dearest, GRADIENT * np.abs(start["b_Vf"])),
-        "B_l": width * _packed(stage),
+        "B_l": width * np.outer(stage, stage),
         "b_l": width * np.maximum(stage * dearest, GRADIENT * np.abs(start["b_l"])),
         "c_f": OFFSET * error_deviation,
         "x_l": bound,
@@ -287,16 +264,10 @@ def prior_deviation(
         if name in start.blocks:
             widths[name] = width * np.abs(start[name])
     floor = np.finfo(np.float64).tiny ** 0.25
-    deviation: Vector = np.concatenate([widths[block.name] for block in start.blocks])
-    return np.maximum(deviation, floor)
+    packed = [block.pack(widths[block.name]) for block in start.blocks]
+    return np.maximum(np.concatenate(packed), floor)
 
 
 def _root_diagonal(matrix: NDArray[np.float64]) -> Vector:
     root: Vector = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     return root
-
-
-def _packed(root: Vector) -> Vector:
-    """D_i D_j of the upper triangle, row by row."""
-    triangle: Vector = np.outer(root, root)[np.triu_indices(root.size)]
-    return triangle

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import reduce
 from importlib.metadata import version
-from itertools import islice
 from math import gcd, inf, isfinite, isnan
 from operator import add
 from pathlib import Path
@@ -159,7 +158,7 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
     All random numbers come from the run's seed.
     """
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
-    strategy = Strategy.of(run.configuration, run.scenario)
+    strategy = Strategy(run.configuration, run.scenario)
     plant_seed, rng = spawn_seeds(run.seed)
     # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
     own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])
@@ -636,12 +635,10 @@ class _Session:
 
     def trouble(self, row: LogRow, judge: Judge) -> str | None:
         """Why the run must stop, or None: two evaluations in a row, or the last, are too dear."""
-        greedy = row["greedy_J"]
-        if not isfinite(greedy) or not greedy > (limit := judge.limit):
-            return None
-        earlier = (last["greedy_J"] for last in islice(reversed(self.rows), 1, None))
-        before = next((judged for judged in earlier if isfinite(judged)), limit)
-        if before <= limit and row["samples"] < self.run.samples:
+        greedy, limit = row["greedy_J"], judge.limit
+        judged = [one["greedy_J"] for one in self.rows if isfinite(one["greedy_J"])]
+        once = len(judged) < 2 or judged[-2] <= limit
+        if not limit < greedy < inf or (once and row["samples"] < self.run.samples):
             return None
         reason = f"greedy J = {shown(greedy)} exceeds {shown(limit)}"
         return f"diverged: {reason} at sample {int(row['samples'])}"
@@ -661,7 +658,7 @@ class _Session:
             return
         state |= {
             "plant": np.frombuffer(plant, dtype=np.uint8),
-            "rows": np.array([list(row.values()) for row in self.rows]),
+            "rows": [[*row.values()] for row in self.rows],
             "row_thetas": np.array([row.parameters.theta for row in self.rows]),
         }
         checkpoint.save(self.out / CHECKPOINT, self.identity, state)
@@ -671,10 +668,9 @@ class _Session:
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
         state = checkpoint.load(self.out / CHECKPOINT, self.identity)
-        rows = zip(state["rows"].tolist(), state["row_thetas"], strict=True)
         self.rows = [
             LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
-            for figures, theta in rows
+            for figures, theta in zip(state["rows"], state["row_thetas"], strict=True)
         ]
         self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
         self.loop.restore(state)

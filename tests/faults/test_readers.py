@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import json
 import pickle
 import zipfile
 from collections.abc import Callable
@@ -65,9 +66,9 @@ def load(path):
     return checkpoint.load(path, make_run().identity())
 
 
-def sealed(arrays):
-    content = b"".join(name.encode() + arrays[name].tobytes() for name in sorted(arrays))
-    return hashlib.sha256(content).hexdigest()
+def sealed(state):
+    content = json.dumps(state, default=lambda array: array.tobytes().hex())
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 PAPER = Scenario.load("paper")

@@ -63,7 +63,7 @@ def looped(
     seed: int,
 ) -> TrainingLoop:
     """A rule in its loop, at the start of the plant's noise `seed`."""
-    strategy, own = Strategy.of(configuration, plant.scenario), np.random.default_rng(0)
+    strategy, own = Strategy(configuration, plant.scenario), np.random.default_rng(0)
     algorithm = rule(controller, plant.scenario, configuration, samples, strategy, own)
     rng = np.random.default_rng(exploration)
     loop = TrainingLoop(plant, controller, algorithm, strategy, rng)

@@ -29,7 +29,7 @@ class Loop:
                 sample = self.transition(candidate, rng)
                 self.change(sample, rng)
                 ended = segment.take(sample, 0.0)
-            segment.answer = segment.told()
+            segment.answer = search.told(segment)
         return search
 
     def transition(self, candidate, rng):
@@ -48,6 +48,7 @@ class Loop:
             a=a,
             next_s=predicted + rng.uniform(-1.0, 1.0, 2) * [1.0, 0.2],
             stage_cost=6000.0 + 50.0 * (s[0] - 25.0) - 10.0 * (s[1] - 80.0),
+            next_penalty=0.0,
             policy=SimpleNamespace(value_gradient=gradient),
         )
 

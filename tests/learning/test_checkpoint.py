@@ -1,4 +1,5 @@
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ def test_another_runs_checkpoint_is_refused_by_the_field_that_differs(stored):
 
 @dataclass
 class Memory:
+    KEPT: ClassVar = ("number", "mean", "began", "weights")
     number: int = 0
     mean: float = 0.0
     began: bool = False

@@ -1,8 +1,11 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from learning import ActorCritic, BatchQLearning, QLearning
 from learning.algorithm import Strategy, load_algorithm
+from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.search import Search
 
@@ -48,7 +51,9 @@ POLICY = np.array([190.0, 215.0])
 
 
 def make(kind, probability=1.0, deviation=(10.0,)):
-    return Strategy(kind, LOWER, UPPER, probability, np.array(deviation))
+    settings = {"exploration_probability": probability, "exploration_deviation": deviation}
+    bounds = SimpleNamespace(action_lower=LOWER, action_upper=UPPER)
+    return Strategy(Configuration(exploration=kind, **settings), bounds)
 
 
 def draws(explore, rng, action=POLICY, count=20_000):

@@ -33,7 +33,7 @@ class Idle:
 def interaction(plant, problem, controller=None, **settings):
     configuration = QLearning.Configuration.from_dict(settings)
     controller = controller or RtiNmpc(problem, starting_parameters(problem, configuration))
-    strategy = Strategy.of(configuration, plant.scenario)
+    strategy = Strategy(configuration, plant.scenario)
     plant_seed, rng = spawn_seeds(4)
     made = TrainingLoop(plant, controller, Idle(), strategy, rng)
     made.start(plant.reset(plant_seed))

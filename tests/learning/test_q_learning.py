@@ -49,7 +49,7 @@ def test_the_papers_rule_takes_the_closed_form_step(plant, problem):
 
 def regression(size, variance, **changes):
     settings = {"clip": np.inf, "memory": np.inf, **changes}
-    return KalmanRegression(np.zeros(size), np.eye(size), variance, **settings)
+    return KalmanRegression(size, variance, **settings)
 
 
 @pytest.fixture

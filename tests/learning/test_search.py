@@ -4,16 +4,22 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant
-from learning.errors import ConfigurationError
+from learning import search
 from learning.search import Search
 from learning.training import TrainingRun, begin
 
 SETTINGS = {
     "none": {},
-    "q-learning": {"rule_settings": {"prior_samples": 40, "step_every": 20}},
-    "batch-q-learning": {"rule_settings": {"batch_size": 40}},
-    "actor-critic": {"rule_settings": {"batch_size": 60}, "q_learning_first": True},
+    "q-learning": {},
+    "batch-q-learning": {},
+    "actor-critic": {"q_learning_first": True},
 }
+
+
+@pytest.fixture(autouse=True)
+def quick_rules(monkeypatch):
+    short = {"prior_samples": 40, "step_every": 20, "batch_size": 40}
+    monkeypatch.setattr(search, "RULE_DEFAULTS", search.RULE_DEFAULTS | short)
 
 
 def learner(plant, rule, samples=1500):
@@ -38,7 +44,7 @@ def test_what_is_handed_over_is_the_incumbent_and_its_trials_are_greedy(plant, r
     assert not np.array_equal(thetas[-1], start), "the naive start is easily beaten"
 
 
-def test_a_search_explores_as_its_rule_does_and_takes_its_settings():
+def test_a_search_explores_as_its_rule_does():
     make = Search.Configuration.from_dict
     for rule, probability in (("none", 0.3), ("q-learning", 0.3), ("actor-critic", 1.0)):
         assert make({"rule": rule}).exploration_probability == probability
@@ -46,11 +52,6 @@ def test_a_search_explores_as_its_rule_does_and_takes_its_settings():
         make({"rule": "actor-critic", "exploration_probability": 0.5}).exploration_probability
         == 0.5
     )
-    chosen = make({"rule": "q-learning", "rule_settings": {"prior_width": 0.1}})
-    assert chosen.rule_configuration("q-learning").prior_width == 0.1
-    for settings in ({"prior_with": 1}, {"exploration_share": 1}):
-        with pytest.raises(ConfigurationError):
-            make({"rule": "q-learning", "rule_settings": settings})
 
 
 @pytest.mark.parametrize("rule", SETTINGS)

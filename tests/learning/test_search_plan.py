@@ -216,7 +216,7 @@ class Quadratic:
             self.stretch += 1
         draw = self.noise * self.draws[getattr(self, "stretch", 0)]
         answer = told(self.cost(request.theta) + draw, 100)
-        if request.deviation is not None:
+        if request.measure is not None:
             jacobian = np.zeros((2, request.theta.size))
             where = self.blocks.slices["b_l"]
             jacobian[0, where.stop - 2] = jacobian[1, where.stop - 1] = -0.05

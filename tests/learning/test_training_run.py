@@ -52,7 +52,7 @@ STATED = {
 def test_what_the_scenario_states_takes_the_place_of_defaults_not_of_what_the_user_sets(scenario):
     stated = scenario.replace(STATED)
     configuration = QLearning.Configuration().for_scenario(stated)
-    strategy = Strategy.of(configuration, scenario)
+    strategy = Strategy(configuration, scenario)
     assert (strategy.kind, configuration.value_offset) == ("literal", "stage-cost")
     assert (strategy.probability, strategy.deviation.tolist()) == (0.2, [3.0, 4.0])
     chosen = Configuration(value_offset="discounted", exploration_probability=0.7)

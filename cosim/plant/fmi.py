@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
+from typing import Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
 from xml.etree import ElementTree
 
@@ -32,9 +32,6 @@ import fmus
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
-
-if TYPE_CHECKING:
-    from cosim.plant.fmu_plant import Wiring
 
 SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
 DESCRIPTION = "modelDescription.xml"
@@ -283,8 +280,9 @@ class Instance(ABC):
     """One co-simulation instance, called through raw function pointers and fixed buffers.
 
     The pointers carry no argument types: ctypes then passes the ready-made C objects through,
-    at half the cost of a checked call. `inputs`, `outputs` and `states` are the buffers, the last
-    two with a NumPy view of the same memory (`…_view`).
+    at half the cost of a checked call. `exchanged` are the places of inputs, outputs and states;
+    `inputs`, `outputs` and `states` are their buffers, the last two with a NumPy view of the same
+    memory (`…_view`).
     """
 
     prefix: ClassVar[str]
@@ -298,14 +296,19 @@ class Instance(ABC):
     """The calls that initialise, with their arguments after the instance."""
 
     def __init__(
-        self, fmu: UnpackedFmu, wiring: Wiring, step_size: float, intermediate: Intermediate | None
+        self,
+        fmu: UnpackedFmu,
+        exchanged: tuple[Sequence[Place], Sequence[Place], Sequence[Place]],
+        starts: Sequence[tuple[Place, float]],
+        step_size: float,
+        intermediate: Intermediate | None,
     ) -> None:
         self.fmu = fmu
         self.messages: deque[str] = deque(maxlen=8)
         self.fatal = False
         self._interface = fmu.description.coSimulation
         self._intermediate = intermediate
-        self._places = (wiring.inputs, wiring.outputs, wiring.states)
+        self._places = inputs, outputs, states = exchanged
         if self._interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
             raise CapabilityError(
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
@@ -317,15 +320,15 @@ class Instance(ABC):
         self.drivable = all(map(self._all_real, self._places))
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
-        self.inputs, self._set_inputs = self._exchange(wiring.inputs, "Set")
-        self.outputs, self._get_outputs = self._exchange(wiring.outputs, "Get")
-        self.states, self._get_states = self._exchange(wiring.states, "Get")
+        self.inputs, self._set_inputs = self._exchange(inputs, "Set")
+        self.outputs, self._get_outputs = self._exchange(outputs, "Get")
+        self.states, self._get_states = self._exchange(states, "Get")
         self.outputs_view: NDArray[np.float64] = np.frombuffer(memoryview(self.outputs))
         self.states_view: NDArray[np.float64] = np.frombuffer(memoryview(self.states))
         self._do_step = self._function("DoStep")
-        places = [place for place, _ in wiring.starts]
+        places = [place for place, _ in starts]
         self._starts, self._set_starts = self._exchange(places, "Set")
-        self._starts[:] = [value for _, value in wiring.starts]
+        self._starts[:] = [value for _, value in starts]
         # FMI 2 counts value references anew for each type.
         self._start_of = {place[:3]: i for i, place in enumerate(places)}
 
@@ -430,7 +433,7 @@ class Instance(ABC):
         return numbers, convert
 
     def change_start(self, place: Place, value: float) -> None:
-        """Replace the start value of a place of the wiring's for the next reset."""
+        """Replace the start value of a place among the `starts` for the next reset."""
         self._starts[self._start_of[place[:3]]] = value
 
     def writer(self, places: Sequence[Place], values: Sequence[float]) -> Callable[[], None]:

@@ -301,7 +301,9 @@ class FmuPlant:
         self._started = False
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
-        self._fmi = wiring.interface(archive, wiring, self._h / self._steps, intermediate)
+        exchanged = wiring.inputs, wiring.outputs, wiring.states
+        step = self._h / self._steps
+        self._fmi = wiring.interface(archive, exchanged, wiring.starts, step, intermediate)
         self.drivable = self._fmi.drivable and self._steps == 1 and intermediate is None
         self._changes = {k: self._fmi.writer(*change) for k, change in wiring.changes().items()}
         self._advance = self._fmi.advance if self._steps == 1 else self._advance_in_steps

@@ -148,8 +148,8 @@ def plain(text: str) -> str:
 def shown_case(name: str) -> str:
     """A case's name as figures set it: `q-learning, naive` for `q-learning(start=naive)`."""
     head, _, settings = name.removesuffix(")").partition("(")
-    if settings and "=" not in settings:  # a file, whose name the case's often repeats
-        return plain(head if settings.endswith(head) else name)
+    if settings and "=" not in settings:  # a controller
+        return plain(name)
     values = (word.removeprefix("start=").replace("=", " ") for word in settings.split())
     return plain(", ".join((head, *values)).replace("_", " "))
 

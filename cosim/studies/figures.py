@@ -224,7 +224,7 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
                 else:
                     policies = {case: _policy(run, out) for case, run in runs.items()}
                     yield stem, phase_figure(found, policies, scenario)
-    for path in (out / run.kept.get(LOG, "?") for run in plan.runs):
+    for path in (out / run.kept.get(LOG, "?") for run in plan.runs if not run.marks):
         if path.is_file() and (blocks := increments(log := read_table(path))):
             columns = (log[name].to_numpy(float) for name in ("samples", "td_error", "updates"))
             samples, td_error, updates = columns

@@ -128,16 +128,16 @@ class Study:
         scenarios = tuple(self.scenarios if table.scenarios is None else table.scenarios)
         _check_known(scenarios, self.scenarios, f"case '{table.name}'", "scenario")
         if table.algorithm is None:
-            sources = table.controller or ""
-            for source in sources if isinstance(sources, list) else [sources]:
+            given = table.controller or ""
+            for source in (sources := given if isinstance(given, list) else [given]):
                 own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
                 name = f"{table.name}({own})" if table.name and sources[1:] else table.name or own
                 group = table.group or BASELINES
                 yield Case(name, scenarios, group, controller=source, against=table.against)
             return
-        given = {"samples": table.samples, "start": table.start, "nmpc": table.nmpc}
+        grid = {"samples": table.samples, "start": table.start, "nmpc": table.nmpc}
         axes: dict[str, list[Any]]
-        axes = {k: v if isinstance(v, list) else [v] for k, v in given.items()}
+        axes = {k: v if isinstance(v, list) else [v] for k, v in grid.items()}
         axes |= {k: _axis(table.algorithm, k, v) for k, v in table.settings.items()}
         if empty := [key for key, values in axes.items() if not values]:
             raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
@@ -151,7 +151,7 @@ class Study:
                 scenarios=scenarios,
                 group=table.group or table.algorithm.rpartition(":")[2],
                 algorithm=table.algorithm,
-                **{axis: point.pop(axis) for axis in given},
+                **{axis: point.pop(axis) for axis in grid},
                 settings=point,
                 training=dict(table.training),
                 training_seeds=tuple(range(seeds.first, seeds.first + seeds.count)),

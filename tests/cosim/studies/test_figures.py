@@ -57,7 +57,7 @@ def test_a_dark_ground_hides_no_controller():
 
 
 def test_one_controller_has_one_colour_on_all_scenarios():
-    looks = palette(["two-fouled(two-fouled)", "two-jump(two-jump)", "q"], ["fouled", "jump"])
+    looks = palette(["two-fouled", "two-jump", "q"], ["fouled", "jump"])
     assert len({look.color for look in looks.values()}) == 2
 
 
@@ -68,7 +68,7 @@ def test_increments_are_of_each_block_since_its_first_row():
 
 def test_a_cases_settings_are_set_after_its_name():
     assert shown_case("q(start=naive prior_width=0.3)") == "q, naive, prior width 0.3"
-    assert shown_case("two-fouled(tuned-two-fouled)") == "two-fouled"
+    assert shown_case("both(naive)") == "both(naive)"
 
 
 def test_many_curves_have_a_panel_for_each_start():

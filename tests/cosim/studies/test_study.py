@@ -254,6 +254,7 @@ def test_files_are_seen_from_the_study():
     found = cases(name=None, algorithm=None, controller=["theta/mine.toml", "module:make"])
     assert [(one.name, one.training_seeds) for one in found] == [("mine", ()), ("module.make", ())]
     assert found[0].controller == "theta/mine.toml"
+    assert [one.name for one in cases(name="mine", algorithm=None, controller="naive")] == ["mine"]
 
 
 def test_a_counterpart_is_that_of_the_same_point_of_the_grid():

@@ -172,6 +172,8 @@ _brought: dict[str, set[str]] = {}
 """Modules that loading a plug-in, and calling its factory, imported, by the plug-in's module."""
 _sources: dict[str, tuple[Any, str]] = {}
 """Users' modules with the hash of their source as it was when they were loaded."""
+_looked_at: dict[str, object] = {}
+"""Modules by name whose source has been looked at."""
 
 
 def depends_on(scenario: Scenario, *parts: Any) -> dict[str, str]:
@@ -282,9 +284,11 @@ def _imports(module: str) -> list[str]:
 def _hash_foreign_modules() -> None:
     """Note the source of users' modules that have been loaded."""
     for name, module in list(sys.modules.items()):
+        if _looked_at.get(name) is module:
+            continue
+        _looked_at[name] = module
         file = getattr(module, "__file__", None)
-        known = name in _sources and _sources[name][0] is module
-        if not known and isinstance(file, str) and _is_foreign(file.rpartition(os.sep)[0]):
+        if isinstance(file, str) and _is_foreign(file.rpartition(os.sep)[0]):
             with suppress(OSError):
                 _sources[name] = (module, _digest(Path(file).read_bytes()))
 

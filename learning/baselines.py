@@ -24,7 +24,7 @@ from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import Configuration, Count
-from learning.episodes import Episode, Planned, Told
+from learning.episodes import Episode, Planned, Told, numbers
 from learning.errors import ConfigurationError, DivergenceError
 from learning.prediction_errors import OneStepModel, PredictionErrors, known_penalty
 from learning.step import moved
@@ -433,8 +433,7 @@ class Identified(Estimate):
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Keep a transition; the last of every `every` gives a new fit."""
-        sample = transition.s, transition.a, transition.next_s
-        self._rows.append(np.concatenate(sample).tolist())
+        self._rows.append(numbers(transition))
         if len(self._rows) != self._every:
             return None
         fitted = self.conclude()

@@ -19,6 +19,12 @@ from learning.step import moved
 Told = dict[str, Any]
 
 
+def numbers(transition: Transition) -> list[float]:
+    """(s, a, s₊) of a transition; so a row takes half of the time that NumPy's functions do."""
+    s, a, following = transition.s, transition.a, transition.next_s
+    return [*s.tolist(), *a.tolist(), *following.tolist()]
+
+
 @dataclass(eq=False)
 class Episode:
     """The next `length` samples at θ (n_θ,), whose `answer` the plan reads when it goes on.
@@ -47,9 +53,9 @@ class Episode:
     def take(self, transition: Transition | None, cost: float) -> bool:
         """Take a sample, None where the controller failed, and its share of J: was it the last?"""
         if transition is not None:
-            number, costs = len(self.costs), (transition.stage_cost, transition.next_penalty)
-            arrays = transition.s, transition.a, transition.next_s
-            self.rows.append([number, *costs, *np.concatenate(arrays).tolist()])
+            number = len(self.costs)
+            costs = number, transition.stage_cost, transition.next_penalty
+            self.rows.append([*costs, *numbers(transition)])
             if self.measure and (measured := self.measure(transition, number)) is not None:
                 self.measured.append(measured.tolist())
         self.costs.append(cost)

@@ -156,7 +156,8 @@ class OptimalPolicy:
         self._axes = [axis.tolist() for axis in optimum.grid.axes]
         self._table = np.column_stack([optimum.actions, optimum.W]).tolist()
         corners = itertools.product((0, 1), repeat=len(self._axes))
-        self._corners = [(c, int(np.ravel_multi_index(c, optimum.grid.shape))) for c in corners]
+        sizes = [len(axis) for axis in self._axes]
+        self._corners = [(c, int(np.ravel_multi_index(c, sizes))) for c in corners]
 
     @classmethod
     def from_scenario(

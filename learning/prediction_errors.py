@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import casadi as ca
 import numpy as np
 
@@ -44,6 +46,7 @@ class OneStepModel:
         function()
         return function.stack.copy()
 
+    @cached_property
     def slowest(self) -> float:
         """Samples of f's slowest time constant at the reference, `SLOWEST` at most."""
         largest = np.abs(np.linalg.eigvals(linear_model(self._problem)[0])).max()

@@ -138,7 +138,7 @@ class ValueRule(Algorithm):
         discount, constants = self.configuration.criterion(self.scenario)
         position = self._step.blocks.slices["c_lambda"].start
         level, cost = float(scale[position]), self.scenario.controller.reference_cost
-        memory = round(constants * self._model.slowest())
+        memory = round(constants * self._model.slowest) if constants else 0
         self._average_cost = AverageCost(discount, position, level, cost, memory)
 
     def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:

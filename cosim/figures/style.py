@@ -59,16 +59,8 @@ class Picture(Figure):
 @contextmanager
 def figure(height: float, width: float = WIDTH) -> Iterator[Figure]:
     """A figure of the house style, in inches, without touching the user's own settings."""
-    with _styled():
+    with mpl.rc_context(fname=_STYLE):
         yield Picture(figsize=(width, height), layout="constrained")
-
-
-@contextmanager
-def _styled() -> Iterator[None]:
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rc_file(_STYLE, use_default_template=False)
-        yield
 
 
 def save(drawn: Figure, path: str | Path) -> Path:
@@ -81,7 +73,7 @@ def save(drawn: Figure, path: str | Path) -> Path:
         raise FigureError(f"cannot draw '{path}': the file must end in .png or .svg")
     content = io.BytesIO()
     FigureCanvasAgg(drawn)
-    with _styled():
+    with mpl.rc_context(fname=_STYLE):
         # The SVG writer adds the date unless told not to.
         metadata = {"Date": None} if kind == "svg" else {"Software": "rti-cosim"}
         drawn.savefig(content, format=kind, dpi=200, metadata=metadata)

@@ -45,6 +45,7 @@ def test_without_a_compiler_there_is_none_and_the_description_says_so(folder, mo
     assert "no C compiler" in description()
 
 
+@pytest.mark.slow
 def test_the_stored_builds_are_those_of_the_presets():
     names = {build_name(each, system) for each in preset_sources() for system in SYSTEMS.values()}
     with tarfile.open(BUILDS) as builds:

@@ -304,10 +304,11 @@ def change_of(scenario: Scenario) -> Change | None:
     if fouled:
         name, value = fouled
         cycle = DAY * scenario.plant.parameters["cleaning_period"]
+        # A microsecond before the cleaning, and after it.
         nodes = np.linspace(value(cycle - 1e-6), value(0.0), NODES).round(6).tolist()
         x, weights = np.polynomial.legendre.leggauss(40)
         return Change(
-            [_frozen(scenario, name, node) for node in nodes],
+            [frozen(scenario, name, node) for node in nodes],
             {name: nodes},
             lambda time: np.asarray(np.interp(value(time), nodes, range(NODES)), dtype=np.float64),
             times=0.5 * cycle * (x + 1.0),
@@ -328,7 +329,7 @@ def change_of(scenario: Scenario) -> Change | None:
     )
 
 
-def _frozen(scenario: Scenario, name: str, value: float) -> Scenario:
+def frozen(scenario: Scenario, name: str, value: float) -> Scenario:
     """The scenario without fouling, its fouled parameter at a value."""
     document = scenario.to_dict()
     given = document["plant"]["parameters"]

@@ -14,7 +14,7 @@ from scipy.stats import ttest_1samp
 
 from controllers import compile_functions
 from controllers.factories import nmpc
-from controllers.optimum import QuasiStaticPolicy, fouling
+from controllers.optimum import QuasiStaticPolicy, fouling, frozen
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
@@ -39,9 +39,7 @@ def plant_at(scenario: Scenario, time: float) -> Scenario:
     """The scenario with its plant frozen at a time in s."""
     if fouled := fouling(scenario):
         name, value = fouled
-        return scenario.replace(
-            {"plant": {"parameters": {name: float(value(time)), "fouling_rate": 0.0}}}
-        )
+        return frozen(scenario, name, float(value(time)))
     return scenario.at(time)
 
 

@@ -422,6 +422,7 @@ class RtiNmpc:
         self._x, self._u, self._costates = (
             made.preparation.part(name).reshape(horizon, -1) for name in LinearisationPoint._fields
         )
+        self._constant = made.preparation.part("constant")
         # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
         places = self._prepare.places
         self._point = before[places["x"].start : places["u"].stop]
@@ -549,8 +550,7 @@ class RtiNmpc:
             self._status = self._engine.prepare()
             finite = self._status != NOT_FINITE
         else:
-            # The constant of the stage costs is last.
-            prepare.memory[-1] = self._hessian.fill(self._x, self._u, self._costates)
+            self._constant[0] = self._hessian.fill(self._x, self._u, self._costates)
             prepare()
             finite = prepare.finite()
         if not finite:
@@ -651,7 +651,7 @@ class RtiNmpc:
         if a is not None:
             found = multipliers_at_kink(qp, found, *self._bounds)
         inputs = read.inputs
-        inputs["constant"][0] = self._prepare.memory[-1]
+        inputs["constant"][0] = self._constant[0]
         inputs["v"][:], inputs["lam"][:] = found.v, found.lam
         read.memory[read.places["nu"]] = found.nu
         read()

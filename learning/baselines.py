@@ -300,15 +300,16 @@ class Estimate(Planned):
         self._start = self.controller.parameters
         self._found = self._start.theta
         self._search: BackOffSearch | None = None
+        samples = self.samples
         if self.asks_for == "simulator" and self.configuration.back_off:
-            left = self.samples - max(round(ESTIMATION * self.samples), 1)
+            samples = max(round(ESTIMATION * self.samples), 1)
+            left = self.samples - samples
             self._search = BackOffSearch(self._start, self.scenario, left, self.rng)
-        self.follow(self._estimate_and_search())
+        self.follow(self._estimate_and_search(samples))
 
-    def _estimate_and_search(self) -> Iterator[Episode]:
+    def _estimate_and_search(self, samples: int) -> Iterator[Episode]:
         if self.asks_for == "operation":
             return  # the estimation does not end
-        samples = max(round(ESTIMATION * self.samples), 1) if self._search else self.samples
         yield (estimation := Episode(self._found, samples))
         self._found = estimation.answer["theta"]
         if self._search is not None:

@@ -411,8 +411,8 @@ class Instance(ABC):
 
             return buffer, exchange
         # Not every integer of 64 bits is a double: what is set is a list.
-        numbers: Any = [0.0] * len(places)
-        numbers = numbers if verb == "Set" else (ctypes.c_double * len(places))(*numbers)
+        count = len(places)
+        numbers: Any = [0.0] * count if verb == "Set" else (ctypes.c_double * count)()
         variables: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
         for place in places:
             suffix, ctype = self.setters[place.type]

@@ -214,6 +214,15 @@ class Problem:
         return ca.dot(self.penalty_linear, violation) + ca.dot(self.penalty_quadratic, violation**2)
 
     @cached_property
+    def discounts(self) -> Vector:
+        """γ⁰ … γᴺ, shape (N+1,).
+
+        NumPy's power differs in the last bit between processors, and with it all that is keyed by
+        the generated C; Python's is the C library's.
+        """
+        return np.array([self.discount**k for k in range(self.horizon + 1)])
+
+    @cached_property
     def units(self) -> Units:
         """Orders of magnitude of states, actions and cost."""
         return Units.of(self)

@@ -107,7 +107,6 @@ def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
 def _constants(made: SampleFunctions, stagewise: bool) -> str:
     problem, blocks = made.problem, made.blocks
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    gamma = problem.discount
     sizes = {"N_X": n, "N_U": m, "N_W": n + m, "HORIZON": horizon, "N_THETA": blocks.size}
     for prefix, call in made.named.items():
         sizes |= {f"{prefix}_{name}": part.start for name, part in call.slices.items()}
@@ -122,13 +121,13 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         vectors += ["penalty_linear", "penalty_quadratic"]
         slack = {kind: f"((void)(theta), PENALTY_{kind.upper()})" for kind in slack}
     arrays = {name.upper(): getattr(problem, name) for name in vectors}
-    arrays["DISCOUNTS"] = gamma ** np.arange(horizon)
-    arrays["SLACK_DISCOUNTS"] = gamma ** np.arange(1, horizon + 1)
+    arrays["DISCOUNTS"] = problem.discounts[:-1]
+    arrays["SLACK_DISCOUNTS"] = problem.discounts[1:]
     return _filled(
         "problem.h.in",
         sizes="\n".join(f"    {name} = {value}," for name, value in sizes.items()),
         arrays="\n".join(_array(name, values) for name, values in arrays.items()),
-        end_discount=repr(float(gamma**horizon)),
+        end_discount=repr(float(problem.discounts[-1])),
         floor=repr(Exact.FLOOR),
         rule=made.hessian.source,
         solver=SOLVERS[stagewise][0],

@@ -536,12 +536,12 @@ class RtiNmpc:
 
     def _weigh(self, w: Vector, W: Vector) -> None:
         """Give the slack of the predicted stages its weights (n,), discounted."""
-        problem, stages = self.problem, np.arange(1, self.problem.horizon + 1)
-        discounts = np.repeat(problem.discount**stages, problem.reference_state.size)
+        horizon, n = self.problem.horizon, self.problem.n_states
+        discounts = np.repeat(self.problem.discounts[1:], n)
         # Make new views: a backend recognises new weights by them.
         self._qp.w, self._qp.W = self._prepare.part("w"), self._prepare.part("W")
-        self._qp.w[:] = discounts * np.tile(w, stages.size)
-        self._qp.W[:] = discounts * np.tile(W, stages.size)
+        self._qp.w[:] = discounts * np.tile(w, horizon)
+        self._qp.W[:] = discounts * np.tile(W, horizon)
 
     def _linearise(self) -> None:
         prepare = self._prepare

@@ -393,8 +393,8 @@ class GaussNewton:
     def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self.functions: dict[str, StackedFunction] = {}
-        self.discounts = problem.discount ** np.arange(horizon)
-        self._end = problem.discount**horizon
+        self.discounts = problem.discounts[:-1]
+        self._end = float(problem.discounts[-1])
         self.L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
         self.q = prepared.inputs["q"].reshape(horizon, n + m)
         self._L_N, self._q_N = prepared.inputs["L_N"], prepared.inputs["q_N"]

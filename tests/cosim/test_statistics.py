@@ -123,6 +123,11 @@ def test_the_bootstrap_over_runs_stays_within_its_strata():
     assert (low, high) == over_runs([spread]).interval
 
 
+def test_the_interval_of_equal_runs_is_their_very_value():
+    for value in np.random.default_rng(3).normal(size=20):
+        assert over_runs([np.full(4, value)]).interval == (value, value)
+
+
 def test_a_diverged_run_is_the_worst_and_spoils_no_interval():
     cost = 100.0 + np.arange(1.0, 8.0)[:, None] + np.zeros((7, 4))
     cost[-1] = np.nan

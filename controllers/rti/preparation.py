@@ -261,7 +261,7 @@ def embedding(
         "embedding",
         {"s": s, "theta": symbols["theta"], **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
-        {name: prepared.part(name).reshape(-1) for name in prior}
+        {name: prepared.part(name) for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
@@ -339,10 +339,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_u": ca.horzcat(v[:, 1:], v[:, -1]) + ca.repmat(u_s, 1, horizon),
             "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
-        {
-            name: prepared.part(name).reshape(-1)
-            for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
-        },
+        {name: prepared.part(name) for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")},
         room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
         | dict.fromkeys(("row_lower", "row_upper"), horizon * n)
         | {"residual": 1, "iterations": 1, "gradient": blocks.size},
@@ -515,7 +512,8 @@ class SampleFunctions:
         """The QP in the memory of preparation and read-out, `before` and `after`, or copies."""
         vectors = ("f", "lower", "upper", "row_lower", "row_upper")
         return SoftQp(
-            rows=self.preparation.part("Gamma", before),
-            **{name: self.preparation.part(name, before) for name in ("H", "w", "W")},
+            H=self.preparation.matrix("H", before),
+            rows=self.preparation.matrix("Gamma", before),
+            **{name: self.preparation.part(name, before) for name in ("w", "W")},
             **{name: self.readout.part(name, after) for name in vectors},
         )

@@ -587,7 +587,12 @@ class RtiNmpc:
         """An error with a copy of the QP, which compiled code may have left uncondensed."""
         self._prepare()
         self._embed()
-        return QpError(message, status=status, qp=self._qp.copy())
+        return QpError(message + self._hint(), status=status, qp=self._qp.copy())
+
+    def _hint(self) -> str:
+        """What may be the cause of a QP without a solution: a coarse integration."""
+        integration = self.problem.integration
+        return f"; the model is integrated coarsely: {integration.remedy}" * integration.coarse
 
     @property
     def linearisation_point(self) -> LinearisationPoint:
@@ -631,7 +636,13 @@ class RtiNmpc:
         if a is not None:
             a = _vector("action", a, problem.reference_action.size)
         solve = self._solve_interpreted if self._engine is None else self._solve_compiled
-        if not solve(s, a):
+        try:
+            finite = solve(s, a)
+        except QpError as error:
+            if self._engine is None:  # the backend knows nothing of the model
+                error.args = (f"{error}{self._hint()}",)
+            raise
+        if not finite:
             message = f"the QP is not finite: state {s}, action {a!r}"
             raise self._failure(message, "state or action not finite")
         memory = self._readout.memory.copy()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
 from controllers.functions import StackedFunction
+from controllers.integration import check_integration
 from controllers.model import runge_kutta
 from controllers.problem import Problem
 from controllers.qp import SoftQp
@@ -485,12 +486,13 @@ class SampleFunctions:
 
     `preparation` and `embedding` make the QP with the rule `hessian`, `readout` takes its value.
     The memory of the first and the last hold a sample's QP and its solution. Raises ControllerError
-    on an unknown Hessian.
+    on an unknown Hessian, ModelError where the model is too stiff for the problem's substeps.
     """
 
     def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
         if hessian not in HESSIANS:
             raise ControllerError(f"there is no Hessian '{hessian}'{instead(hessian, HESSIANS)}")
+        check_integration(problem)
         self.problem, self.blocks = problem, blocks
         self.preparation = preparation(problem, blocks)
         self.readout = readout(problem, blocks, self.preparation)

@@ -131,7 +131,8 @@ class Model:
         for name in names:
             if name not in known:
                 raise ModelError(
-                    f"model '{self.name}' has no parameter '{name}'; it has {', '.join(known)}"
+                    f"model '{self.name}' has no parameter '{name}'; "
+                    f"it has {', '.join(known) or 'none'}"
                 )
         return [known.index(name) for name in names]
 

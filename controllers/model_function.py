@@ -103,8 +103,8 @@ class ModelFunction:
             constant = function.instruction_constant(k)
             if not isfinite(constant):
                 raise self.error(
-                    f"it contains the constant {constant}: look for a division by zero, or a "
-                    "number that is missing"
+                    f"it contains the constant {constant}: look for a division by zero, a number "
+                    "that is missing, or math.… or float(…) of an expression"
                 )
 
     def error(self, reason: str) -> ModelError:

@@ -299,6 +299,8 @@ def load_model(name: str | None) -> Model:
     factory = load_plugin(name, f"model '{name}'", ModelError)
     try:
         model = factory()
+    except ModelError as error:  # it has a model's own words
+        raise ModelError(f"{name}: {error}") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise ModelError(f"model '{name}' cannot be made: {exception_line(error)}") from error
     if not isinstance(model, Model):

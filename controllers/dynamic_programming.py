@@ -276,9 +276,12 @@ class Elementwise:
             if code == ca.OP_CONST:
                 inputs = [function.instruction_constant(k)]
             elif code not in (ca.OP_INPUT, ca.OP_OUTPUT, *_OPERATIONS):
+                what = f"operation {code} of CasADi"
+                if code == ca.OP_CALL:
+                    what = "a call of a CasADi function, such as a table,"
                 raise ModelError(
-                    f"function '{function.name()}': operation {code} of CasADi cannot be "
-                    "evaluated over arrays; write the model without it"
+                    f"function '{function.name()}': {what} cannot be evaluated over arrays; "
+                    "write the model without it"
                 )
             self._program.append((code, inputs, function.instruction_output(k)))
 

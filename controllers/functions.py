@@ -19,7 +19,7 @@ import numpy as np
 from controllers.errors import ControllerError
 from cosim.files import cache_folder, lock, temporary_folder
 from cosim.processes import child_process
-from cosim.protocols import Vector
+from cosim.protocols import Matrix, Vector
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 
@@ -34,11 +34,11 @@ class StackedFunction:
     """A CasADi function of expressions whose arguments and results live in fixed NumPy arrays.
 
     `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
-    read the results by `part`. A call allocates nothing. All results share one flat array, `stack`,
-    so that one copy keeps them all. The inputs follow each other in one array but for the `shared`
-    ones, which are read from other memory, such as another function's output. Own inputs
-    and results are one array, `memory`: a given one, or one with `room` behind them for more, by
-    name and size; `places` are slices of it by name, `slices` the results' in `stack`. The
+    read the results by `part`, or `matrix`. A call allocates nothing. All results share one flat
+    array, `stack`, so that one copy keeps them all. The inputs follow each other in one array but
+    for the `shared` ones, which are read from other memory, such as another function's output. Own
+    inputs and results are one array, `memory`: a given one, or one with `room` behind them for
+    more, by name and size; `places` are slices of it by name, `slices` the results' in `stack`. The
     expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
     """
 
@@ -62,11 +62,14 @@ class StackedFunction:
         )
         shared = shared or {}
         sizes = {name: argument.numel() for name, argument in arguments.items()}
+        for name_, array in shared.items():
+            _check_array(name_, array, sizes[name_])
         own = {name: size for name, size in sizes.items() if name not in shared}
         all_sizes = own | {"stack": function.numel_out(0)} | dict(room or {})
-        self.memory: Vector = np.zeros(sum(all_sizes.values())) if memory is None else memory
+        total = sum(all_sizes.values())
+        self.memory: Vector = np.zeros(total) if memory is None else memory
+        _check_array("memory", self.memory, total)
         self.places = consecutive(all_sizes)
-        assert all(a.shape == (sizes[name],) and a.flags.c_contiguous for name, a in shared.items())
         self.inputs = {
             name: shared[name] if name in shared else self.memory[self.places[name]]
             for name in sizes
@@ -82,21 +85,74 @@ class StackedFunction:
         self.shapes = {name: result.shape for name, result in results.items()}
 
     def __call__(self) -> None:
-        """Evaluate at `inputs`, into `stack`."""
-        self._evaluate()
+        """Evaluate at `inputs`, into `stack`; NaN where a solver inside the function fails."""
+        try:
+            self._evaluate()
+        except RuntimeError:  # CasADi's, of a root finder or an integrator say
+            self.stack[:] = np.nan
 
     def finite(self) -> bool:
         """Whether all results are finite."""
         return bool(np.isfinite(self.stack).all())
 
     def part(self, name: str, memory: Vector | None = None) -> Vector:
-        """View of a part of the memory, or of a copy of it: flat, a result with columns by columns.
+        """View of a part of the memory, or of a copy of it, flat: a result by its columns."""
+        return (self.memory if memory is None else memory)[self.places[name]]
 
-        That is its transpose in row-major order, of shape (columns, rows).
+    def matrix(self, name: str, memory: Vector | None = None) -> Matrix:
+        """View of a result as the transpose of its expression: shape (columns, rows).
+
+        What is a matrix is the caller's to say: one column may be either.
         """
-        flat = (self.memory if memory is None else memory)[self.places[name]]
-        rows, columns = self.shapes.get(name, (0, 1))
-        return flat if columns == 1 else flat.reshape(columns, rows)
+        rows, columns = self.shapes[name]
+        return self.part(name, memory).reshape(columns, rows)
+
+
+def _check_array(name: str, array: Vector, size: int) -> None:
+    """CasADi reads and writes raw memory: a wrong array would be a wrong number or a crash."""
+    if array.shape != (size,) or array.dtype != np.float64 or not array.flags.c_contiguous:
+        raise ValueError(f"{name} must be {size} doubles in a row, not {array.dtype} {array.shape}")
+
+
+IN_C = frozenset(
+    {
+        "SXFunction",
+        "MXFunction",
+        "Map",
+        "Switch",
+        "LinearInterpolant",
+        "LinearInterpolantJac",
+        "BSplineInterpolant",
+    }
+)
+"""CasADi's classes of functions whose C needs nothing but itself and the mathematical library."""
+
+
+def not_in_c(functions: Sequence[ca.Function]) -> str | None:
+    """Say which function inside of these cannot be C by itself; None where all can.
+
+    Such are externals, callbacks, integrators, iterative root finders and optimisers. CasADi's
+    interpreter evaluates them.
+    """
+    for function in functions:
+        for part in [function, *function.find_functions()]:
+            if part.class_name() not in IN_C:
+                return f"the model calls '{part.name()}', a {part.class_name()} of CasADi"
+    return None
+
+
+def work_sizes(prefix: str, function: ca.Function) -> dict[str, int]:
+    """Sizes that a call of a function's C needs, by the names of constants that begin so.
+
+    They are the lengths of `arg`, `res`, `iw` and `w`. The first two exceed the numbers of inputs
+    and outputs where the function calls others: CasADi keeps their pointers behind its own.
+    """
+    return {
+        f"{prefix}_ARG": function.sz_arg(),
+        f"{prefix}_RES": function.sz_res(),
+        f"{prefix}_IW": function.sz_iw(),
+        f"{prefix}_W": function.sz_w(),
+    }
 
 
 # Of two zeros of unlike sign CasADi's interpreter returns the first, the C library the second.
@@ -110,10 +166,15 @@ def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     """C99 source of the functions; it needs the mathematical library alone.
 
     Each becomes `int NAME(const double** arg, double** res, long long* iw, double* w, int mem)`,
-    with `NAME_work` for the sizes of its work vectors. Compiled without contraction of products
+    whose arrays must have the sizes of `work_sizes`, and which returns 0 unless it fails. None of
+    them needs a memory checked out, so `mem` is 0. Compiled without contraction of products
     and sums (-ffp-contract=off) and without fast-math it gives the interpreter's bytes. The same
-    functions give the same source. The names of its helpers begin with `name`.
+    functions give the same source. The names of its helpers begin with `name`. Raises
+    ControllerError where a function cannot be C by itself (`not_in_c`).
     """
+    reason = not_in_c(functions)
+    if reason is not None:
+        raise ControllerError(f"{reason}, which cannot be written as C of its own")
     generator = ca.CodeGenerator(f"{name}.c")
     for function in functions:
         generator.add(function)

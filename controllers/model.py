@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from math import isfinite
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ModelError
+from controllers.model_function import ModelFunction
+
+KINDS = ("states", "actions", "disturbances", "parameters")
+"""The kinds of a model's quantities, in the order of its functions' arguments."""
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 
@@ -31,6 +36,11 @@ class Model:
     quantities; `economic_cost` is ℓ; `name` is for messages; `time_unit` is the length in seconds
     of the unit of time in which `ode` counts; `uncertain` names the parameters that a plant may
     well have otherwise, which identification fits unless told which.
+
+    `ode` returns a column of n expressions, or a list, tuple or array of n scalars; the cost is
+    one scalar. Both are called once with symbols when the model is made. Raises ModelError in one
+    line where that fails, where they return something else or depend on what is no entry of x, u, d
+    and p, and on names, values or units that do not fit.
     """
 
     name: str
@@ -42,6 +52,66 @@ class Model:
     economic_cost: Expression = field(repr=False)
     time_unit: float = 1.0
     uncertain: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for kind in KINDS:
+            object.__setattr__(self, kind, self._quantities(kind))
+        quantities = [quantity for kind in KINDS for quantity in getattr(self, kind)]
+        names = [quantity.name for quantity in quantities]
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise ModelError(
+                f"model '{self.name}': {', '.join(doubled)} is the name of more than one quantity; "
+                "give each a name of its own"
+            )
+        for kind in ("states", "actions"):
+            if not getattr(self, kind):
+                raise ModelError(f"model '{self.name}' has no {kind}; it needs at least one")
+        if not (isinstance(self.time_unit, int | float) and 0 < self.time_unit < float("inf")):
+            raise ModelError(
+                f"model '{self.name}': time_unit must be positive seconds, not {self.time_unit!r}"
+            )
+        object.__setattr__(self, "uncertain", tuple(self.uncertain))
+        self.parameter_indices(self.uncertain)
+        for name, rows in (("ode", len(self.states)), ("economic_cost", 1)):
+            function = getattr(self, name)
+            if not callable(function):
+                raise ModelError(
+                    f"model '{self.name}': {name} must be a function (x, u, d, p), "
+                    f"not {type(function).__name__}"
+                )
+            if isinstance(function, ModelFunction):  # of a copy
+                function = function.function
+            checked = ModelFunction(function, name, self.name, rows)
+            checked.check(self.symbols())
+            object.__setattr__(self, name, checked)
+
+    def _quantities(self, kind: str) -> tuple[Quantity, ...]:
+        given = getattr(self, kind)
+        if isinstance(given, Quantity) or not isinstance(given, list | tuple):
+            raise ModelError(
+                f"model '{self.name}': {kind} must be a tuple of controllers.Quantity, "
+                f"not {type(given).__name__}; one alone is written (Quantity(…),)"
+            )
+        for quantity in given:
+            if not isinstance(quantity, Quantity):
+                raise ModelError(
+                    f"model '{self.name}': {kind} must hold controllers.Quantity, not {quantity!r}"
+                )
+            if not (isinstance(quantity.name, str) and quantity.name):
+                raise ModelError(
+                    f"model '{self.name}': one of the {kind} has no name: {quantity!r}"
+                )
+            try:
+                finite = isfinite(quantity.nominal)
+            except TypeError:
+                finite = False
+            if not finite:
+                raise ModelError(
+                    f"model '{self.name}': the nominal value of {quantity.name} must be a finite "
+                    f"number, not {quantity.nominal!r}"
+                )
+        return tuple(given)
 
     @property
     def nominal_disturbance(self) -> NDArray[np.float64]:
@@ -61,7 +131,8 @@ class Model:
         for name in names:
             if name not in known:
                 raise ModelError(
-                    f"model '{self.name}' has no parameter '{name}'; it has {', '.join(known)}"
+                    f"model '{self.name}' has no parameter '{name}'; "
+                    f"it has {', '.join(known) or 'none'}"
                 )
         return [known.index(name) for name in names]
 

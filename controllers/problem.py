@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError, OptimumError
+from controllers.integration import Integration, measure_integration
 from controllers.model import Model
 from controllers.qp import FIXED, MEANING, SETTINGS
 from cosim.plugins import exception_line, load_plugin
@@ -175,6 +176,48 @@ class Problem:
             )
         if not np.isfinite(self.reference_cost):
             raise ModelError(f"problem: reference_cost must be finite, not {self.reference_cost}")
+        self._check_reference()
+
+    def _check_reference(self) -> None:
+        """Raise ModelError unless the model has finite values and derivatives at the reference."""
+        model, n = self.model, self.n_states
+        x, u, d, p = model.symbols()
+        point = ca.vertcat(x, u)
+        results = []
+        for function in (model.ode, model.economic_cost):
+            value = ca.SX(function(x, u, d, p))
+            results += [value, ca.jacobian(value, point)]
+        evaluate = ca.Function("at_reference", [x, u, d, p], results)
+        values = evaluate(
+            self.reference_state,
+            self.reference_action,
+            model.nominal_disturbance,
+            model.nominal_parameters,
+        )
+        rate, rates, cost, slope = (value.full() for value in values)
+        names = [quantity.name for quantity in (*model.states, *model.actions)]
+        found = [(f"ode(x, u, d, p): d/dt {names[i]}", rate[i, 0]) for i in range(n)]
+        found += [
+            (f"ode(x, u, d, p): the derivative of d/dt {names[i]} by {names[j]}", rates[i, j])
+            for i in range(n)
+            for j in range(len(names))
+        ]
+        found.append(("economic_cost(x, u, d, p): the cost", cost[0, 0]))
+        found += [
+            (f"economic_cost(x, u, d, p): the derivative of the cost by {name}", slope[0, j])
+            for j, name in enumerate(names)
+        ]
+        for what, value in found:
+            if not np.isfinite(value):
+                at = ", ".join(
+                    f"{name} = {float(at):g}"
+                    for name, at in zip(names, self.reference, strict=True)
+                )
+                raise ModelError(
+                    f"model '{model.name}', {what} is {value} at the reference ({at}), where the "
+                    "controller linearises first; give another reference_state and "
+                    "reference_action, or a smooth expression"
+                )
 
     @property
     def n_states(self) -> int:
@@ -227,6 +270,11 @@ class Problem:
         """Orders of magnitude of states, actions and cost."""
         return Units.of(self)
 
+    @cached_property
+    def integration(self) -> Integration:
+        """How accurate the prediction of a sample is, measured on first use."""
+        return measure_integration(self)
+
     def value_level(self, discount: float | None = None) -> float:
         """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.
 
@@ -260,6 +308,8 @@ def load_model(name: str | None) -> Model:
     factory = load_plugin(name, f"model '{name}'", ModelError)
     try:
         model = factory()
+    except ModelError as error:  # it has a model's own words
+        raise ModelError(f"{name}: {error}") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise ModelError(f"model '{name}' cannot be made: {exception_line(error)}") from error
     if not isinstance(model, Model):

@@ -13,8 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.export.core import SOURCES, STACK_LIMIT, STATUSES, controller_sources, stack_needed
+from controllers.errors import ControllerError, ModelWarning, ParameterError, QpError, warn
+from controllers.export.core import (
+    SOURCES,
+    STACK_LIMIT,
+    STATUSES,
+    controller_sources,
+    stack_needed,
+    why_not_in_c,
+)
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp, make_backend, multipliers_at_kink
@@ -85,7 +92,7 @@ class Prepared:
 
     def part(self, name: str) -> Vector:
         """An input, result or other part of the preparation's memory, flat."""
-        return self.functions.preparation.part(name, self.memory).reshape(-1)
+        return self.functions.preparation.part(name, self.memory)
 
     @cached_property
     def point(self) -> LinearisationPoint:
@@ -116,8 +123,11 @@ class RtiSolution:
     enforced: bool = False
     status: str = "solved"
 
-    def _part(self, name: str) -> Matrix:
+    def _part(self, name: str) -> Vector:
         return self.prepared.functions.readout.part(name, self.memory)
+
+    def _by_stage(self, name: str) -> Matrix:
+        return self.prepared.functions.readout.matrix(name, self.memory)
 
     @cached_property
     def multipliers(self) -> QpSolution:
@@ -135,7 +145,7 @@ class RtiSolution:
     @cached_property
     def predicted_states(self) -> Matrix:
         """Predicted states x_0 … x_N, shape (N+1, n)."""
-        return self._part("xi") + self.prepared.functions.problem.reference_state
+        return self._by_stage("xi") + self.prepared.functions.problem.reference_state
 
     @cached_property
     def predicted_actions(self) -> Matrix:
@@ -153,7 +163,7 @@ class RtiSolution:
     @property
     def slack(self) -> Matrix:
         """Slack of the soft state bounds at stages 1 … N, shape (N, n)."""
-        return self._part("t")
+        return self._by_stage("t")
 
     @property
     def costates(self) -> Matrix:
@@ -162,7 +172,7 @@ class RtiSolution:
         χ_0 is dV/ds or dQ/ds. At a true bound the penalty of s itself has a kink, and half of its
         slope is taken.
         """
-        return self._part("chi")
+        return self._by_stage("chi")
 
     @property
     def action_gradient(self) -> Vector:
@@ -247,7 +257,7 @@ class RtiSolution:
     def _write_solution(self, function: StackedFunction) -> None:
         inputs, prepared = function.inputs, self.prepared
         for name in SOLUTION:
-            inputs[name][:] = self._part(name).reshape(-1)
+            inputs[name][:] = self._part(name)
         for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
         if "M" in inputs:
@@ -444,7 +454,12 @@ class RtiNmpc:
         same to rounding and to DAQP's accuracy (`tests/controllers/rti/test_engine.py` holds the
         bounds).
         """
-        if not self._compilable or (samples < LONG and switch() != "now"):
+        if not self._compilable or (samples < LONG and switch() != "now") or switch() == "never":
+            return
+        reason = why_not_in_c(self._functions)
+        if reason is not None:
+            self._compilable = False
+            warn(f"{reason}: the controller is not compiled, which is slower", ModelWarning)
             return
         self._engine = Engine.compile(self._functions)
         self.functions = INTERPRETED if self._engine is None else COMPILED
@@ -572,7 +587,12 @@ class RtiNmpc:
         """An error with a copy of the QP, which compiled code may have left uncondensed."""
         self._prepare()
         self._embed()
-        return QpError(message, status=status, qp=self._qp.copy())
+        return QpError(message + self._hint(), status=status, qp=self._qp.copy())
+
+    def _hint(self) -> str:
+        """What may be the cause of a QP without a solution: a coarse integration."""
+        integration = self.problem.integration
+        return f"; the model is integrated coarsely: {integration.remedy}" * integration.coarse
 
     @property
     def linearisation_point(self) -> LinearisationPoint:
@@ -616,7 +636,13 @@ class RtiNmpc:
         if a is not None:
             a = _vector("action", a, problem.reference_action.size)
         solve = self._solve_interpreted if self._engine is None else self._solve_compiled
-        if not solve(s, a):
+        try:
+            finite = solve(s, a)
+        except QpError as error:
+            if self._engine is None:  # the backend knows nothing of the model
+                error.args = (f"{error}{self._hint()}",)
+            raise
+        if not finite:
             message = f"the QP is not finite: state {s}, action {a!r}"
             raise self._failure(message, "state or action not finite")
         memory = self._readout.memory.copy()

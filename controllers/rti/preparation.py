@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
 from controllers.functions import StackedFunction
+from controllers.integration import check_integration
 from controllers.model import runge_kutta
 from controllers.problem import Problem
 from controllers.qp import SoftQp
@@ -260,7 +262,7 @@ def embedding(
         "embedding",
         {"s": s, "theta": symbols["theta"], **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
-        {name: prepared.part(name).reshape(-1) for name in prior}
+        {name: prepared.part(name) for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
@@ -338,10 +340,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_u": ca.horzcat(v[:, 1:], v[:, -1]) + ca.repmat(u_s, 1, horizon),
             "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
-        {
-            name: prepared.part(name).reshape(-1)
-            for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
-        },
+        {name: prepared.part(name) for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")},
         room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
         | dict.fromkeys(("row_lower", "row_upper"), horizon * n)
         | {"residual": 1, "iterations": 1, "gradient": blocks.size},
@@ -487,17 +486,23 @@ class SampleFunctions:
 
     `preparation` and `embedding` make the QP with the rule `hessian`, `readout` takes its value.
     The memory of the first and the last hold a sample's QP and its solution. Raises ControllerError
-    on an unknown Hessian.
+    on an unknown Hessian, ModelError where the model is too stiff for the problem's substeps.
     """
 
     def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
         if hessian not in HESSIANS:
             raise ControllerError(f"there is no Hessian '{hessian}'{instead(hessian, HESSIANS)}")
+        check_integration(problem)
         self.problem, self.blocks = problem, blocks
         self.preparation = preparation(problem, blocks)
         self.readout = readout(problem, blocks, self.preparation)
         self.embedding = embedding(problem, blocks, self.preparation, self.readout)
         self.hessian = HESSIANS[hessian](problem, blocks, self.preparation)
+
+    @cached_property
+    def stage(self) -> ca.Function:
+        """The linearisation of one stage, which C calls for each."""
+        return stage_linearisation(self.problem, self.blocks)
 
     @property
     def named(self) -> dict[str, StackedFunction]:
@@ -509,7 +514,8 @@ class SampleFunctions:
         """The QP in the memory of preparation and read-out, `before` and `after`, or copies."""
         vectors = ("f", "lower", "upper", "row_lower", "row_upper")
         return SoftQp(
-            rows=self.preparation.part("Gamma", before),
-            **{name: self.preparation.part(name, before) for name in ("H", "w", "W")},
+            H=self.preparation.matrix("H", before),
+            rows=self.preparation.matrix("Gamma", before),
+            **{name: self.preparation.part(name, before) for name in ("w", "W")},
             **{name: self.readout.part(name, after) for name in vectors},
         )

@@ -4,8 +4,11 @@
 
 static void symmetric(const double packed[], int size, double scale, double matrix[]) {
     for (int i = 0; i < size; i++)
-        for (int j = i; j < size; j++)
-            matrix[i * size + j] = matrix[j * size + i] = scale * *packed++;
+        for (int j = i; j < size; j++) {
+            const double entry = scale * *packed++;
+            matrix[i * size + j] = entry;
+            matrix[j * size + i] = entry;
+        }
 }
 
 /* ½ξᵀL_N ξ + q_Nᵀξ */

@@ -141,7 +141,8 @@ static QpStatus stages_factorise(const RtiPrepared *prepared, RtiWork *work, int
                 double sum = 0.0;
                 for (int l = 0; l < N_X; l++) sum += loop[l][i] * half[l];
                 for (int l = 0; l < N_W; l++) sum += stage[l][i] * bent[l];
-                following[i][j] = following[j][i] = sum;
+                following[i][j] = sum;
+                following[j][i] = sum;
             }
         }
         memcpy(P, following, sizeof P);

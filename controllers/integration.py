@@ -1,0 +1,208 @@
+"""How far the controller's Runge-Kutta steps are from the model's own solution over a sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.errors import ModelError, ModelWarning, warn
+from cosim.protocols import Matrix
+
+if TYPE_CHECKING:
+    from controllers.problem import Problem
+
+Mask = NDArray[np.bool_]
+
+TOLERANCE = 0.01
+"""Share of a state's range by which a sample's prediction may be off without a word."""
+MOST = 1000
+"""Most substeps that are tried."""
+CORNERS = 16
+"""Most corners of the bounds that are tried; of more, each bound alone."""
+MARGIN = 1e-6
+"""How far above 1 a mode's growth must be to count as one: rounding is below."""
+
+
+@dataclass(frozen=True)
+class Integration:
+    """The largest error of a sample's prediction, as a share of the ranges of the states.
+
+    `error` is that of x₊ and, at the reference, of its derivatives by (x, u), each times the width
+    of its bounds.
+    `state` names the state where it is largest, `at_reference` says whether that is at the
+    reference or at the bounds. `suffices` is a number of substeps, the problem's own doubled and
+    doubled again, whose error is below `TOLERANCE`; None where `MOST` is not enough. `unstable`
+    says whether a mode that decays at the reference grows in the prediction.
+    """
+
+    error: float
+    state: str
+    at_reference: bool
+    suffices: int | None
+    unstable: bool
+
+    @property
+    def coarse(self) -> bool:
+        """Whether the error is above `TOLERANCE`."""
+        return not self.error <= TOLERANCE
+
+    @property
+    def remedy(self) -> str:
+        """What mends a coarse integration, in a few words."""
+        if self.suffices is None:
+            return (
+                f"even substeps = {MOST} is too few: replace the fast states by what they settle at"
+            )
+        return f"set substeps = {self.suffices} in the table [controller]"
+
+
+class _Predictor:
+    """A sample of the nominal model and its derivatives, at many points at once."""
+
+    def __init__(self, problem: Problem) -> None:
+        model = problem.model
+        x, u, d, p = model.symbols()
+        rate = model.ode(x, u, d, p)
+        slope = ca.jacobian(rate, ca.vertcat(x, u))
+        rates = ca.Function("rates", [x, u, d, p], [ca.densify(rate), ca.densify(ca.vec(slope))])
+        nominal = model.nominal_disturbance, model.nominal_parameters
+        at_nominal: Any = rates(x, u, *map(ca.SX, map(ca.DM, nominal)))
+        self._rates = ca.Function("rates", [x, u], at_nominal)
+        self.length = problem.sampling_time / model.time_unit
+
+    def slopes(self, x: Matrix, u: Matrix) -> tuple[Matrix, Matrix]:
+        """Rates (P, n) and their derivatives by (x, u), (P, n, n+m), at x (P, n) and u (P, m)."""
+        rates, slopes = (value.full().T for value in self._rates(x.T, u.T))
+        n = x.shape[1]
+        return rates, slopes.reshape(len(x), -1, n).transpose(0, 2, 1)
+
+    def modes(self, x: Matrix, u: Matrix) -> NDArray[np.complex128]:
+        """Eigenvalues (P, n) of the rates' derivatives by x; 0 where these are not finite."""
+        _, slopes = self.slopes(x, u)
+        by_state = slopes[:, :, : x.shape[1]]
+        finite: Mask = np.array(np.isfinite(by_state).all(axis=(1, 2)))
+        return np.linalg.eigvals(np.where(finite[:, None, None], by_state, 0.0)).astype(complex)
+
+    def __call__(self, x: Matrix, u: Matrix, substeps: int) -> Matrix:
+        """x₊ and its derivatives by (x, u) side by side, (P, n, 1+n+m)."""
+        count, n = x.shape
+        m = u.shape[1]
+        by_action = np.hstack([np.zeros((m, n)), np.eye(m)])
+        state = np.zeros((count, n, 1 + n + m))
+        state[:, :, 0] = x
+        state[:, :, 1 : 1 + n] = np.eye(n)
+        h = self.length / substeps
+
+        def rate(state: Matrix) -> Matrix:
+            value, slope = self.slopes(state[:, :, 0], u)
+            moved = slope[:, :, :n] @ state[:, :, 1:] + slope[:, :, n:] @ by_action
+            return np.concatenate([value[:, :, None], moved], axis=2)
+
+        for _ in range(substeps):
+            k1 = rate(state)
+            k2 = rate(state + h / 2 * k1)
+            k3 = rate(state + h / 2 * k2)
+            k4 = rate(state + h * k3)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return state
+
+
+def measure_integration(problem: Problem) -> Integration:
+    """Compare a sample's prediction with those of twice, four times … as many substeps.
+
+    That is at the reference and at corners of the bounds. A corner from which the model's own
+    solution is not finite is passed over.
+    """
+    n, substeps = problem.n_states, problem.substeps
+    points = _points(problem)
+    x, u = points[:, :n], points[:, n:]
+    predict = _Predictor(problem)
+    modes = predict.modes(x, u)
+    length = predict.length
+    widths = problem.upper - problem.lower
+    scale = np.hstack([1.0, widths]) / widths[:n, None]
+    suffices = None
+    with np.errstate(all="ignore"):  # a prediction that runs away is a result here
+        coarse = present = predict(x, u, substeps)
+        while substeps <= MOST:
+            finer = predict(x, u, 2 * substeps)
+            grows = _grows(modes, length / substeps)
+            if _errors(present, finer, scale, grows).max() <= TOLERANCE / 2:
+                suffices = substeps
+                break
+            substeps, present = 2 * substeps, finer
+        grows = _grows(modes, length / problem.substeps)
+        errors = _errors(coarse, finer, scale, grows)
+    point, state = np.unravel_index(int(errors.argmax()), errors.shape)
+    return Integration(
+        error=float(errors.max()),
+        state=problem.model.states[state].name,
+        at_reference=bool(point == 0),
+        suffices=suffices,
+        unstable=bool(grows[0]),
+    )
+
+
+def check_integration(problem: Problem) -> None:
+    """Refuse a prediction that is unstable where the model is not; warn where it is coarse.
+
+    Raises ModelError at a mode that decays in the model and grows in the prediction.
+    """
+    found, model = problem.integration, problem.model
+    if found.unstable:
+        raise ModelError(
+            f"model '{model.name}' is too stiff for substeps = {problem.substeps}: at the "
+            "reference a mode that decays grows in the prediction of a sample of "
+            f"{problem.sampling_time:g} s; {found.remedy}"
+        )
+    if found.coarse:
+        where = "at the reference" if found.at_reference else "at the bounds"
+        size = f"{100 * found.error:.0f} % of" if found.error < 10 else "many times"
+        warn(
+            f"model '{model.name}' is integrated coarsely by substeps = {problem.substeps}: "
+            f"{where} a prediction over {problem.sampling_time:g} s is off by {size} the range of "
+            f"{found.state}; {found.remedy}",
+            ModelWarning,
+        )
+
+
+def _points(problem: Problem) -> Matrix:
+    """The reference, then corners of the bounds of (x, u), one a row."""
+    lower, upper, reference = problem.lower, problem.upper, problem.reference
+    if 2 ** len(lower) <= CORNERS:
+        corners = list(product(*zip(lower, upper, strict=True)))
+    else:
+        corners = []
+        for i in range(len(lower)):
+            for bound in (lower[i], upper[i]):
+                corner = reference.copy()
+                corner[i] = bound
+                corners.append(tuple(corner))
+    return np.array([reference, *corners])
+
+
+def _errors(present: Matrix, finer: Matrix, scale: Matrix, grows: Mask) -> Matrix:
+    """Errors (P, n) of predictions (P, n, 1+n+m) that have finer ones.
+
+    Where there is no finite one the error is infinite if a mode `grows` (P,), else the solution of
+    the model is not finite either, and the error is 0.
+    """
+    parts = np.abs(finer - present) * scale
+    # Derivatives count at the reference alone: at a corner a table's kinks are no lack of substeps.
+    errors = np.concatenate([parts[:1].max(axis=2), parts[1:, :, 0]])
+    errors = np.where(np.isfinite(errors), errors, np.inf)
+    finite: Mask = np.array(np.isfinite(finer).all(axis=(1, 2)))
+    without = np.where(grows, np.inf, 0.0)
+    return np.asarray(np.where(finite[:, None], errors, without[:, None]))
+
+
+def _grows(modes: NDArray[np.complex128], h: float) -> Mask:
+    """Whether of modes (P, n) one that decays is outside of the stability region of a step h."""
+    z = modes * h
+    growth = np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)
+    return np.asarray(((modes.real < 0) & (growth > 1 + MARGIN)).any(axis=1))

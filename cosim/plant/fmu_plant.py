@@ -98,6 +98,12 @@ class FmuPlant:
         self._reading = self._probe.reading
         if plant.outputs is not None:
             self._reading = self._probe.stated(plant.outputs)
+        if plant.model is not None and not self._probe.cost_of_sample:
+            raise PlantError(
+                f"plant.model is for the optimum, whose cost is that of a sample's begin, and "
+                f"'{plant.stage_cost}' of FMU '{archive.path.name}' is that of a step's end; "
+                "leave plant.model out"
+            )
         for name, asked, value in self._probe.findings.misset:
             raise PlantError(
                 f"FMU '{archive.path.name}' was given {name} = {asked:g} and has {value:g} after "

@@ -73,8 +73,8 @@ class Report:
 
     `rows` tell it; the other fields are the same for programs. `outputs` is the value of
     `plant.outputs` that fits, None where the outputs differ; `kinds` says where each output
-    belongs, by name, stage cost first. `still` are the actions that move no state and no output,
-    `undriven` the inputs that nobody sets, with their start values.
+    belongs, by name, stage cost first. `still` are the actions that move no state, and whether
+    they move an output; `undriven` the inputs that nobody sets, with their start values.
     """
 
     fmu: Path
@@ -86,7 +86,7 @@ class Report:
     snapshots: bool
     serialises: bool
     experiment: Experiment
-    still: tuple[str, ...]
+    still: dict[str, bool]
     undriven: dict[str, str]
     starts_anywhere: bool
 
@@ -326,18 +326,67 @@ def as_asked(asked: float, value: float) -> bool:
     return abs(asked - value) <= 1e-6 * max(abs(asked), abs(value))
 
 
+class Point(NamedTuple):
+    """What follows from sample `k` on: the numbers before the step, after it, after half of it, and
+    after short ones under either input.
+    """
+
+    k: int
+    before: Sample
+    after: Sample
+    half: Sample
+    short: tuple[Sample, ...]
+
+    def moves(self) -> bool:
+        """Whether half a step ends in another state than a whole one."""
+        return self.after.states != self.half.states
+
+    def is_continuous(self, i: int) -> bool | None:
+        """Whether output i is hardly moved by a short step, whatever the input.
+
+        An output that the step computes from the input is: it jumps, for one input at least. None
+        where nothing moves: neither the output in a step, nor anything in a short one.
+        """
+        before, after = self.before.outputs[i], self.after.outputs[i]
+        made = any(
+            sample.states != self.before.states or sample.outputs[i] != before
+            for sample in self.short
+        )
+        if not made:
+            return None if after == before else False
+        reach = HARDLY * abs(after - before)
+        return all(abs(sample.outputs[i] - before) <= reach for sample in self.short)
+
+
+def _kind_of(i: int, points: Sequence[Point], acts: bool, starts_alike: bool) -> Kind:
+    """Where output i belongs, of one that changes and does not follow a set.
+
+    `acts` says that it depends on the action of the same step, `starts_alike` that its value after
+    the initialisation repeats.
+    """
+    if any(point.after.outputs[i] != point.half.outputs[i] for point in points):
+        shown = {point.is_continuous(i) for point in points} - {None}
+        return Kind.INSTANT if shown == {True} and starts_alike else Kind.END
+    for point in points:
+        changed = point.after.outputs[i] != point.before.outputs[i]
+        if point.moves() and (changed or (acts and point.k == 0)):
+            return Kind.SAMPLE
+    return Kind.OPEN
+
+
 class Findings(NamedTuple):
     """What `Probe` finds out before a plant runs.
 
-    `kinds` (p,) say where each output belongs; `harmless` that a get after a set changes nothing
-    of what follows; `misset` are name, value asked for and value had of the start values that the
-    FMU has not as asked; `failure` is what the FMU said if it failed meanwhile, else empty.
+    `kinds` (p,) say where each output belongs; `harmless` whether a get after a set leaves what
+    follows as it is, None where that is not known. `misset` are the start values that the FMU has
+    not as asked: name, value asked for, value had. `failure` is what the FMU said if it failed
+    meanwhile, else empty.
     """
 
     experiment: Experiment
     restart: Restart
     kinds: tuple[Kind, ...]
-    harmless: bool
+    harmless: bool | None
     misset: tuple[tuple[str, float, float], ...]
     failure: str
 
@@ -355,6 +404,7 @@ class Probe:
         self._inputs = (high, low, high, low, low, high)
         self._other_inputs = (low, low, low, low, low, low)
         self._late_inputs = (high, low, low)
+        self._open = (Kind.OPEN,) * len(subject.names[1])
 
     @cached_property
     def findings(self) -> Findings:
@@ -377,31 +427,33 @@ class Probe:
             finally:
                 bench.close()
         # It fails at once: the plant will say so when it is used.
-        kinds = (Kind.OPEN,) * len(self.subject.names[1])
-        return Findings(attempts[0], Restart.FRESH, kinds, False, (), failures[0])
+        return Findings(attempts[0], Restart.FRESH, self._open, None, (), failures[0])
 
     def _examine(self, bench: _Bench, first: Run, experiment: Experiment) -> Findings:
-        kinds: tuple[Kind, ...] = (Kind.OPEN,) * len(self.subject.names[1])
-        restart, harmless, failure = Restart.FRESH, False, ""
-        misset: tuple[tuple[str, float, float], ...] = ()
+        """What the runs after a first one show; the first failure ends it."""
+        seen = Findings(experiment, Restart.FRESH, self._open, None, (), "")
         try:
             bench.resets = _same(bench.run(self._inputs, by_reset=True), first)
         except PlantError as error:
-            failure = str(error)
+            seen = seen._replace(failure=str(error))
         try:
             if bench.resets:
-                restart = Restart.RESET
-            elif not _same(bench.run(self._inputs, by_reset=False), first):
-                failure = failure or "two new instances give different numbers"
-                return Findings(experiment, restart, kinds, harmless, misset, failure)
-            harmless = _same(bench.run(self._inputs, look=True), first)
-            kinds = self._kinds(bench, first, harmless)
-            misset = self._misset(bench)
+                seen = seen._replace(restart=Restart.RESET)
+                starts_alike = True
+            else:
+                second = bench.run(self._inputs, by_reset=False)
+                starts_alike = second.outputs == first.outputs
+                if not _same(second.samples, first.samples):
+                    line = "two new instances under the same actions give different numbers"
+                    return seen._replace(failure=seen.failure or line)
+            looked = bench.run(self._inputs, look=True).samples
+            seen = seen._replace(harmless=_same(looked, first.samples))
+            kinds = self._kinds(bench, first, looked if seen.harmless else (), starts_alike)
+            return seen._replace(kinds=kinds, misset=self._misset(bench))
         except _CannotStartAgainError as error:
-            restart, failure = Restart.NEVER, str(error)
+            return seen._replace(restart=Restart.NEVER, failure=str(error))
         except PlantError as error:
-            failure = str(error)
-        return Findings(experiment, restart, kinds, harmless, misset, failure)
+            return seen._replace(failure=str(error))
 
     def _misset(self, bench: _Bench) -> tuple[tuple[str, float, float], ...]:
         asked = [value for _, value in self.subject.starts]
@@ -409,59 +461,55 @@ class Probe:
         rows = zip(self.subject.start_names, asked, present, strict=False)
         return tuple(row for row in rows if not as_asked(*row[1:]))
 
-    def _kinds(self, bench: _Bench, first: Run, harmless: bool) -> tuple[Kind, ...]:
-        """Where each output belongs, by runs that differ in one thing."""
-        step, low, high = self.subject.step, self.subject.low, self.subject.high
-        other = bench.run(self._other_inputs[:1], look=True)
-        looked = bench.run(self._inputs[:3], look=True)
-        late = bench.run(self._late_inputs, look=True)
-        half = bench.run([high], sizes=[step / 2])
-        moves = first.samples[0].states != half.samples[0].states
-        shorts: list[Run] = []
-        for inputs in (low, high):
-            try:
-                shorts.append(bench.run([inputs], sizes=[step * SHORT]))
-            except PlantError:
-                break
+    def _kinds(
+        self, bench: _Bench, first: Run, looked: Sequence[Sample], starts_alike: bool
+    ) -> tuple[Kind, ...]:
+        """Where each output belongs, by runs that differ in one thing.
+
+        `looked` are the samples of `first` with a look after each set, if that is harmless.
+        """
+        other = bench.run(self._other_inputs[:1], look=bool(looked))
+        follows = [False] * len(self.subject.names[1])
+        if looked:
+            late = bench.run(self._late_inputs, look=True)
+            for i in range(len(follows)):
+                at_once = looked[0].looked[i] != other.samples[0].looked[i]
+                follows[i] = at_once and looked[2].looked[i] != late.samples[2].looked[i]
+        points = [self._point(bench, first, 0)]
+        if self.subject.fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
+            points.append(self._point(bench, first, 2))
         kinds = []
         for i, place in enumerate(self.subject.exchanged[1]):
-            after = [sample.outputs[i] for sample in first.samples]
-            follows = (
-                looked.samples[0].looked[i] != other.samples[0].looked[i]
-                and looked.samples[2].looked[i] != late.samples[2].looked[i]
-            )
-            until_end = after[0] != half.samples[0].outputs[i]
-            acts = after[0] != other.samples[0].outputs[i]
-            changes = acts or until_end or {first.outputs[i]} != set(after)
+            acts = first.samples[0].outputs[i] != other.samples[0].outputs[i]
+            changes = {first.outputs[i]} != {sample.outputs[i] for sample in first.samples}
             if place in self.subject.exchanged[2]:
                 kinds.append(Kind.INSTANT)
-            elif follows and harmless:
+            elif follows[i]:
                 kinds.append(Kind.FOLLOWS)
-            elif not changes:
+            elif not (acts or changes):
                 kinds.append(Kind.CONSTANT)
-            elif until_end:
-                instant = not follows and self._is_continuous(first, shorts, i)
-                kinds.append(Kind.INSTANT if instant else Kind.END)
-            elif moves and (acts or after[0] != first.outputs[i]):
-                kinds.append(Kind.SAMPLE)
             else:
-                kinds.append(Kind.OPEN)
+                made = [point for point in points if point is not None]
+                kinds.append(_kind_of(i, made, acts, starts_alike))
         return tuple(kinds)
 
-    def _is_continuous(self, first: Run, shorts: Sequence[Run], i: int) -> bool:
-        """Whether output i stays in a short step what it was before, whatever the inputs.
-
-        A step that moves no state was not made.
-        """
-        if len(shorts) < 2:
-            return False
-        begin, distance = first.outputs[i], abs(first.samples[0].outputs[i] - first.outputs[i])
-        for short in shorts:
-            if short.samples[0].states == short.states:
-                return False
-            if not abs(short.samples[0].outputs[i] - begin) <= HARDLY * distance:
-                return False
-        return True
+    def _point(self, bench: _Bench, first: Run, k: int) -> Point | None:
+        """Steps of other lengths from sample k on; None where the FMU refuses them."""
+        step = self.subject.step
+        before = first.samples[k - 1] if k else Sample((), first.states, first.outputs)
+        try:
+            other, *short = (
+                bench.run((*self._inputs[:k], values), sizes=[step] * k + [size]).samples[k]
+                for values, size in (
+                    (self._inputs[k], step / 2),
+                    (self.subject.low, step * SHORT),
+                    (self.subject.high, step * SHORT),
+                )
+            )
+        except PlantError:
+            bench.instantiate()
+            return None
+        return Point(k, before, first.samples[k], other, tuple(short))
 
     @cached_property
     def reading(self) -> Reading:
@@ -487,17 +535,32 @@ class Probe:
     def stated(self, outputs: str) -> Reading:
         """The reading for a value of `plant.outputs`; raises PlantError where it was seen wrong."""
         wrong = AFTER if outputs == "before-step" else BEFORE
-        for name, kind in zip(self.subject.names[1], self.findings.kinds, strict=True):
-            if kind in wrong:
-                fits = self.outputs
-                cure = f'set plant.outputs = "{fits}"' if fits else "leave plant.outputs out"
-                raise PlantError(
-                    f'plant.outputs = "{outputs}" does not fit FMU '
-                    f"'{self.subject.fmu.path.name}': output '{name}' {kind.value}; {cure}"
-                )
+        kinds = self.findings.kinds
+        seen = next(
+            (
+                f"output '{name}' {kind.value}"
+                for name, kind in zip(self.subject.names[1], kinds, strict=True)
+                if kind in wrong
+            ),
+            "",
+        )
+        if not seen and outputs == "before-step" and self.findings.harmless is False:
+            seen = "a get after a set changes what follows"
+        if seen:
+            cure = f'set it to "{self.outputs}"' if self.outputs else "leave it out"
+            raise PlantError(
+                f'plant.outputs = "{outputs}" does not fit FMU '
+                f"'{self.subject.fmu.path.name}': {seen}; {cure}"
+            )
         if outputs == "after-step":
             return Reading(Order.SET_STEP_GET)
-        return Reading(self.reading.order, ()) if self.outputs == outputs else Reading(_LEGAL)
+        instant = Kind.INSTANT in kinds and Kind.FOLLOWS not in kinds
+        return Reading(Order.GET_SET_STEP if instant else Order.SET_GET_STEP)
+
+    @property
+    def cost_of_sample(self) -> bool:
+        """Whether the stage cost is that of the sample's begin, ℓ(x_k, u_k, d_k), or may be."""
+        return self.findings.kinds[0] is not Kind.END
 
     @cached_property
     def snapshots(self) -> str:
@@ -529,7 +592,10 @@ class Probe:
         return fmi, states, bench.go_on(fmi, self._inputs[1:], first=1)
 
     def _try_snapshot(self, bench: _Bench) -> str:
+        without = bench.run(self._inputs)
         fmi, states, samples = self._saved(bench)
+        if not _same(samples, without.samples[1:]):
+            return "while a state is saved the same steps give other numbers"
         fmi.load(bench.handle)
         if tuple(fmi.states) != states:
             return "a state that was saved and set again is another one"
@@ -548,26 +614,26 @@ class Probe:
         return ""
 
     @cached_property
-    def still(self) -> tuple[str, ...]:
-        """The actions that move no state and no output by themselves."""
+    def still(self) -> dict[str, bool]:
+        """The actions that move no state by themselves, and whether they move an output."""
         bench = _Bench(self.subject, self.findings.experiment)
         try:
             bench.instantiate()
-            rest = bench.run(self._other_inputs)
-            names = []
+            rest = bench.run(self._other_inputs).samples
+            names = {}
             for i, name in enumerate(self.subject.names[0]):
                 moved = list(self.subject.low)
                 moved[i] = self.subject.high[i]
-                if _same(bench.run([tuple(moved)] * len(self._other_inputs)), rest):
-                    names.append(name)
-            return tuple(names)
+                samples = bench.run([tuple(moved)] * len(rest)).samples
+                if [sample.states for sample in samples] == [sample.states for sample in rest]:
+                    names[name] = not _same(samples, rest)
+            return names
         except PlantError:
-            return ()
+            return {}
         finally:
             bench.close()
 
 
-_LEGAL = Order.GET_SET_STEP
 _probes: dict[tuple[Any, ...], Probe] = {}
 
 
@@ -633,14 +699,7 @@ def _report(seen: Probe, starts_anywhere: bool) -> Report:
         _ability_row("snapshot", seen.snapshots, "plants can be saved and restored"),
         _ability_row("serialise", seen.serialises, "checkpoints of a training carry the plant"),
         _experiment_row(findings.experiment, subject.experiment),
-        Row(
-            "actions that move nothing",
-            ", ".join(seen.still) or "none",
-            "no controller can act by them as things are: an enable input may have to be set, by "
-            "plant.parameters"
-            if seen.still
-            else "each moves a state or an output",
-        ),
+        _still_row(seen.still),
         Row(
             "inputs that nobody drives",
             ", ".join(f"{name} = {start or '?'}" for name, start in undriven.items()) or "none",
@@ -689,6 +748,13 @@ def _restart_row(findings: Findings) -> Row:
         Restart.NEVER: "one episode a process: neither a reset nor a second instance is possible",
     }
     return Row("episodes", findings.restart.value, consequence[findings.restart])
+
+
+def _still_row(still: dict[str, bool]) -> Row:
+    moves = {True: "moves outputs only", False: "moves nothing"}
+    names = "; ".join(f"{name} {moves[outputs]}" for name, outputs in still.items())
+    consequence = "no controller can act by them so: plant.parameters may set an input that enables"
+    return Row("actions that move no state", names or "none", consequence if still else "")
 
 
 def _ability_row(subject: str, fault: str, use: str) -> Row:

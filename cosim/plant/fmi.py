@@ -231,8 +231,7 @@ def library_path(fmu: UnpackedFmu) -> Path:
     )
 
 
-OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
-ACCEPTED = frozenset((OK, WARNING))
+WARNING, DISCARD, FATAL = 1, 2, 4
 _STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 # fmpy changes the working directory while it loads a library.
@@ -359,7 +358,10 @@ class Instance(ABC):
         self.experiment = experiment
         self._order = reading.order
         self._step_size = ctypes.c_double(step_size)
-        self._no_return: Any = ctypes.c_int(1)
+        self.no_return: Any = ctypes.c_int(1)
+        """Whether no snapshot may take the FMU back to before its present time: an FMU may have to
+        hold on to its past for that (noSetFMUStatePriorToCurrentPoint).
+        """
         self._time = ctypes.c_double(0.0)
         self.inputs, self._set_inputs = self._exchange(inputs, "Set")
         self.outputs, self._get_outputs = self._exchange(outputs, "Get")
@@ -422,7 +424,7 @@ class Instance(ABC):
 
     def _call(self, name: str, *arguments: Any) -> None:
         """Call a function of FMI; raises PlantError where it fails."""
-        if (status := self._function(name)(*arguments)) not in ACCEPTED:
+        if (status := self._function(name)(*arguments)) and status != WARNING:
             self.fail(name, status)
 
     def initialise(self, started: bool) -> None:
@@ -443,16 +445,9 @@ class Instance(ABC):
         self._time.value = time
         self._first()
         self._second()
-        if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
+        if (status := self._do_step(*self._step_arguments)) and status != WARNING:
             self.fail("DoStep", status)
         self._third()
-
-    def keep_past(self, keep: bool) -> None:
-        """Say whether a snapshot may take the FMU back to before its present time.
-
-        An FMU may have to hold on to its past for that (noSetFMUStatePriorToCurrentPoint).
-        """
-        self._no_return.value = not keep
 
     def write_inputs(self, values: Sequence[float]) -> None:
         """Set the inputs, one number of each; for a probe, which takes a step in its parts."""
@@ -467,7 +462,7 @@ class Instance(ABC):
     def take_step(self, time: float, size: float) -> list[float]:
         """Step from `time` by `size` [s], and nothing else; return the states after it."""
         self._time.value, self._step_size.value = time, size
-        if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
+        if (status := self._do_step(*self._step_arguments)) and status != WARNING:
             self.fail("DoStep", status)
         self._get_states()
         return list(self.states)
@@ -513,7 +508,7 @@ class Instance(ABC):
             arguments = self._arguments([place.reference for place in places], buffer)
 
             def exchange() -> None:
-                if (status := function(*arguments)) not in ACCEPTED:
+                if (status := function(*arguments)) and status != WARNING:
                     self.fail(name, status)
 
             return buffer, exchange
@@ -559,7 +554,7 @@ class Instance(ABC):
 
         It holds for the moment: a snapshot that comes or goes changes `no_return`.
         """
-        self._native.no_return = self._no_return.value
+        self._native.no_return = self.no_return.value
         return self._native
 
     @cached_property
@@ -581,7 +576,7 @@ class Instance(ABC):
             self.experiment.start_time,
             self._step_size.value,
             self._order,
-            self._no_return.value,
+            self.no_return.value,
         )
 
     def fail_native(self, fault: int, status: int) -> None:
@@ -602,7 +597,6 @@ class Instance(ABC):
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
-        self.require_state()
         self._call(f"Get{self._state}", self._component, ctypes.byref(handle))
 
     def load(self, handle: ctypes.c_void_p) -> None:
@@ -716,7 +710,7 @@ class Fmi2Instance(Instance):
 
     @cached_property
     def _step_arguments(self) -> tuple[Any, ...]:
-        return (self._component, self._time, self._step_size, self._no_return)
+        return (self._component, self._time, self._step_size, self.no_return)
 
     def _instantiate(self, **where: Any) -> Any:
         name = f"cosim-{next(_numbers)}"
@@ -760,8 +754,8 @@ class Fmi3Instance(Instance):
         event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
         self._last_time = ctypes.c_double()
         found = (event, self._terminate, self._early, self._last_time)
-        self._no_return = ctypes.c_bool(self._no_return.value)
-        given = (self._component, self._time, self._step_size, self._no_return)
+        self.no_return = ctypes.c_bool(self.no_return.value)
+        given = (self._component, self._time, self._step_size, self.no_return)
         return (*given, *(ctypes.byref(each) for each in found))
 
     def _instantiate(self, **where: Any) -> Any:
@@ -811,5 +805,16 @@ class Fmi3Instance(Instance):
         if self._raised is not None:
             raise self._raised
         if self._terminate.value or self._early.value:
-            self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
-            self.fail("DoStep", DISCARD)
+            self._fail_early()
+
+    def take_step(self, time: float, size: float) -> list[float]:
+        """Step as in FMI 2.0; an FMU that ends the step early is an error."""
+        self._raised = None
+        states = super().take_step(time, size)
+        if self._terminate.value or self._early.value:
+            self._fail_early()
+        return states
+
+    def _fail_early(self) -> NoReturn:
+        self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
+        self.fail("DoStep", DISCARD)

@@ -90,7 +90,7 @@ class FmuPlant:
         self._elsewhere = False
         self._m = len(plant.actions)
         self._k = _NOT_STARTED
-        self._started = False
+        self._started = self._saves = False
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
         self._wiring, self._intermediate = wiring, intermediate
@@ -109,6 +109,7 @@ class FmuPlant:
                 f"FMU '{archive.path.name}' was given {name} = {asked:g} and has {value:g} after "
                 "its initialisation"
             )
+        self._resets = self._probe.findings.restart is Restart.RESET
         self._start_time = self._probe.findings.experiment.start_time
         self._instantiate()
 
@@ -160,7 +161,7 @@ class FmuPlant:
         """
         fmi = self._instance
         words = seed_words(seed, self._seeds)
-        if self._started and self._probe.findings.restart is not Restart.RESET:
+        if self._started and not self._resets:
             fmi = self._begin_anew()
         for place, word in words:
             fmi.change_start(place, word)
@@ -214,7 +215,7 @@ class FmuPlant:
         self._inputs[:] = values
         penalty, k = self._penalty_now, self._k
         self._k = _NOT_STARTED
-        if k in self._changes:
+        if self._changes and k in self._changes:
             self._changes[k]()
         self._advance(self._start_time + k * self._h)
         states, cost = self._states[:], self._outputs[0]
@@ -258,9 +259,11 @@ class FmuPlant:
     def snapshot(self) -> Snapshot:
         """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""
         fmi = self._running()
-        fmi.require_state()
-        self._require_proof(self._probe.snapshots, "save and restore")
-        handle = self._handle()
+        if not self._saves:
+            fmi.require_state()
+            self._require_proof(self._probe.snapshots, "save and restore")
+            self._saves = True
+        handle = self._handle(fmi)
         fmi.save(handle)
         return Snapshot(self, fmi, handle, self._k)
 
@@ -291,7 +294,7 @@ class FmuPlant:
         self._require_proof(self._probe.serialises, "serialise")
         if not self._started:
             self.reset(0)
-        handle = self._handle()
+        handle = self._handle(fmi)
         fmi.deserialise(data[_HEADER.size :], handle)
         return Snapshot(self, fmi, handle, k)
 
@@ -311,9 +314,9 @@ class FmuPlant:
             )
         return self._instance
 
-    def _handle(self) -> ctypes.c_void_p:
+    def _handle(self, fmi: Instance) -> ctypes.c_void_p:
         """Memory of a dropped snapshot, or a null handle, which the FMU allocates."""
-        self._instance.keep_past(True)
+        fmi.no_return.value = False
         if not self._free_handles:
             self._handles.append(handle := ctypes.c_void_p())
             return handle
@@ -323,7 +326,7 @@ class FmuPlant:
         """Keep a dropped snapshot's memory for the next one; each snapshot calls this."""
         if instance is self._fmi:
             self._free_handles.append(handle)
-            instance.keep_past(len(self._free_handles) < len(self._handles))
+            instance.no_return.value = len(self._free_handles) == len(self._handles)
 
     def close(self) -> None:
         """Free the FMU instance and every snapshot; a closed plant refuses all calls."""

@@ -585,7 +585,8 @@ class Probe:
     def _saved(self, bench: _Bench) -> tuple[Instance, tuple[float, ...], tuple[Sample, ...]]:
         """Save after the first sample; the states then, and what followed."""
         fmi = bench.start()
-        fmi.keep_past(True)
+        fmi.require_state()
+        fmi.no_return.value = False
         bench.go_on(fmi, self._inputs[:1])
         states = tuple(fmi.states)
         fmi.save(bench.handle)

@@ -233,16 +233,18 @@ class _Bench:
     def __init__(self, subject: Subject, experiment: Experiment) -> None:
         self._subject, self._experiment = subject, experiment
         self._instance: Instance | None = None
+        self._is_new = False
         self.resets = False
         self.handle = ctypes.c_void_p()
 
     def start(self, *, by_reset: bool | None = None) -> Instance:
         """An initialised instance; `by_reset` forces how it is had."""
-        reset = self._instance is not None and (self.resets if by_reset is None else by_reset)
-        if not reset:
+        reset = self.resets if by_reset is None else by_reset
+        if self._instance is None or not (self._is_new or reset):
             self.instantiate()
         assert self._instance is not None
-        self._instance.initialise(started=reset)
+        self._instance.initialise(started=not self._is_new)
+        self._is_new = False
         return self._instance
 
     def instantiate(self) -> None:
@@ -261,6 +263,7 @@ class _Bench:
             self._experiment,
             None,
         )
+        self._is_new = True
 
     def close(self) -> None:
         """Free the instance and what was saved of it."""

@@ -58,6 +58,7 @@ static int begin(Model *m, double start, bool stop_defined, bool tolerance_defin
 
 static int end(Model *m) {
     static double noise;
+    m->set = 0;
     if (!has(m, DEAF)) m->real[X] = m->real[X_START];
     if (has(m, RESTLESS)) m->real[W] = noise += 0.125;
     if (has(m, HALF_LOUD) && m->real[KEY] == 7.0) m->real[KEY] = 3.0;

@@ -98,12 +98,8 @@ class FmuPlant:
         self._reading = self._probe.reading
         if plant.outputs is not None:
             self._reading = self._probe.stated(plant.outputs)
-        if plant.model is not None and not self._probe.cost_of_sample:
-            raise PlantError(
-                f"plant.model is for the optimum, whose cost is that of a sample's begin, and "
-                f"'{plant.stage_cost}' of FMU '{archive.path.name}' is that of a step's end; "
-                "leave plant.model out"
-            )
+        if plant.model is not None:
+            self.require_cost_of_sample()
         for name, asked, value in self._probe.findings.misset:
             raise PlantError(
                 f"FMU '{archive.path.name}' was given {name} = {asked:g} and has {value:g} after "
@@ -112,6 +108,20 @@ class FmuPlant:
         self._resets = self._probe.findings.restart is Restart.RESET
         self._start_time = self._probe.findings.experiment.start_time
         self._instantiate()
+
+    def require_cost_of_sample(self) -> None:
+        """Refuse what is compared with the optimum, where the stage cost is of another instant.
+
+        Raises:
+            PlantError: The stage cost that the FMU gives is that of the end of a step; the optimum
+                is for ℓ(x_k, u_k, d_k).
+        """
+        if not self._probe.cost_of_sample:
+            raise PlantError(
+                f"'{self.scenario.plant.stage_cost}' of FMU '{self.fmu_path.name}' is known at the "
+                "end of a step only, and the optimum is for the cost at a sample's begin: there is "
+                "no J* of this plant (leave plant.model out)"
+            )
 
     def _instantiate(self) -> None:
         """Make an instance of the FMU, and look up what a step uses of it."""

@@ -85,7 +85,7 @@ def test_a_cost_of_the_steps_end_is_that_and_bars_the_optimum(made):
     for habits in (EAGER, SHY):
         states, costs, _ = driven(made(habits))
         np.testing.assert_array_equal(costs, exact_cost(states[1:], ACTIONS))
-        with pytest.raises(PlantError, match=r"plant\.model is for the optimum.*a step's end"):
+        with pytest.raises(PlantError, match=r"end of a step only.*no J"):
             FmuPlant(made(habits, model="controllers.tanks:model"))
 
 
@@ -197,6 +197,17 @@ def test_a_run_goes_on_beyond_the_files_stop_time_and_to_a_stated_one(made):
         assert plant.scenario.hash == made().hash
     told = probe(made(NEEDS_STOP, stop_time=40.0)).experiment.stop_time
     assert (told, probe(made(NEEDS_STOP)).experiment.stop_time) == (40.0, 4.0)
+
+
+@pytest.mark.parametrize(("habits", "end"), [(0, 0), (LAGGED, 0), (FREE, 0), (EAGER, 1)])
+def test_the_outputs_of_a_sample_of_several_steps_are_those_of_its_first(made, habits, end):
+    _, costs, _ = driven(made(habits, communication_step=STEP / 4))
+    fine = made(habits).replace({"sampling_time": STEP / 4})
+    with FmuPlant(fine) as plant:
+        states = [plant.reset(0)[0]]
+        states += [plant.step([u]).s[0] for u in np.repeat(ACTIONS, 4)]
+    expected = (np.array(states)[end:-1:4][:STEPS] - 2.0) ** 2
+    np.testing.assert_array_equal(costs, expected + (0.0 if habits == FREE else ACTIONS**2))
 
 
 def test_a_report_says_what_was_found(made):

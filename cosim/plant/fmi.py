@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from math import inf
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
@@ -752,7 +753,8 @@ class Fmi3Instance(Instance):
     @cached_property
     def _step_arguments(self) -> tuple[Any, ...]:
         event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
-        self._last_time = ctypes.c_double()
+        # Infinite where an FMU does not say how far it came.
+        self._last_time = ctypes.c_double(inf)
         found = (event, self._terminate, self._early, self._last_time)
         self.no_return = ctypes.c_bool(self.no_return.value)
         given = (self._component, self._time, self._step_size, self.no_return)
@@ -804,17 +806,18 @@ class Fmi3Instance(Instance):
         super().advance(time)
         if self._raised is not None:
             raise self._raised
-        if self._terminate.value or self._early.value:
-            self._fail_early()
+        self._check_end(time + 0.5 * self._step_size.value)
 
     def take_step(self, time: float, size: float) -> list[float]:
         """Step as in FMI 2.0; an FMU that ends the step early is an error."""
         self._raised = None
         states = super().take_step(time, size)
-        if self._terminate.value or self._early.value:
-            self._fail_early()
+        self._check_end(time + 0.5 * size)
         return states
 
-    def _fail_early(self) -> NoReturn:
-        self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
-        self.fail("DoStep", DISCARD)
+    def _check_end(self, least: float) -> None:
+        """Raise PlantError where a step ended early; `least` [s] is a time that it had to pass."""
+        last = self._last_time.value
+        if self._terminate.value or self._early.value or last < least:
+            self.messages.append(f"the FMU ended the step early, at {last} s")
+            self.fail("DoStep", DISCARD)

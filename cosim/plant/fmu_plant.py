@@ -100,11 +100,8 @@ class FmuPlant:
             self._reading = self._probe.stated(plant.outputs)
         if plant.model is not None:
             self.require_cost_of_sample()
-        for name, asked, value in self._probe.findings.misset:
-            raise PlantError(
-                f"FMU '{archive.path.name}' was given {name} = {asked:g} and has {value:g} after "
-                "its initialisation"
-            )
+        if self._probe.misfit:
+            raise PlantError(self._probe.misfit)
         self._resets = self._probe.findings.restart is Restart.RESET
         self._start_time = self._probe.findings.experiment.start_time
         self._instantiate()

@@ -277,6 +277,7 @@ class _Bench:
         *,
         look: bool = False,
         sizes: Sequence[float] = (),
+        spacing: float | None = None,
         by_reset: bool | None = None,
     ) -> Run:
         """Start, and step under these inputs, by `sizes` [s] where they are not the step.
@@ -285,7 +286,8 @@ class _Bench:
         """
         fmi = self.start(by_reset=by_reset)
         states, outputs = tuple(fmi.states), tuple(fmi.read_outputs())
-        return Run(states, outputs, self.go_on(fmi, inputs, look=look, sizes=sizes))
+        samples = self.go_on(fmi, inputs, look=look, sizes=sizes, spacing=spacing)
+        return Run(states, outputs, samples)
 
     def go_on(
         self,
@@ -295,9 +297,10 @@ class _Bench:
         first: int = 0,
         look: bool = False,
         sizes: Sequence[float] = (),
+        spacing: float | None = None,
     ) -> tuple[Sample, ...]:
-        """Step from sample `first` on."""
-        step, samples = self._subject.step, []
+        """Step from sample `first` on; samples lie `spacing` [s] apart, if not a step."""
+        step, samples = spacing or self._subject.step, []
         lengths = sizes or [step] * len(inputs)
         for k, (values, size) in enumerate(zip(inputs, lengths, strict=True), first):
             fmi.write_inputs(values)
@@ -382,7 +385,8 @@ class Findings(NamedTuple):
 
     `kinds` (p,) say where each output belongs; `harmless` whether a get after a set leaves what
     follows as it is, None where that is not known. `misset` are the start values that the FMU has
-    not as asked: name, value asked for, value had. `failure` is what the FMU said if it failed
+    not as asked: name, value asked for, value had. `keeps_to_step` is false where a step goes
+    equally far however long it is told to be. `failure` is what the FMU said if it failed
     meanwhile, else empty.
     """
 
@@ -391,6 +395,7 @@ class Findings(NamedTuple):
     kinds: tuple[Kind, ...]
     harmless: bool | None
     misset: tuple[tuple[str, float, float], ...]
+    keeps_to_step: bool
     failure: str
 
 
@@ -430,11 +435,11 @@ class Probe:
             finally:
                 bench.close()
         # It fails at once: the plant will say so when it is used.
-        return Findings(attempts[0], Restart.FRESH, self._open, None, (), failures[0])
+        return Findings(attempts[0], Restart.FRESH, self._open, None, (), True, failures[0])
 
     def _examine(self, bench: _Bench, first: Run, experiment: Experiment) -> Findings:
         """What the runs after a first one show; the first failure ends it."""
-        seen = Findings(experiment, Restart.FRESH, self._open, None, (), "")
+        seen = Findings(experiment, Restart.FRESH, self._open, None, (), True, "")
         try:
             bench.resets = _same(bench.run(self._inputs, by_reset=True), first)
         except PlantError as error:
@@ -452,11 +457,27 @@ class Probe:
             looked = bench.run(self._inputs, look=True).samples
             seen = seen._replace(harmless=_same(looked, first.samples))
             kinds = self._kinds(bench, first, looked if seen.harmless else (), starts_alike)
-            return seen._replace(kinds=kinds, misset=self._misset(bench))
+            seen = seen._replace(kinds=kinds, misset=self._misset(bench))
+            return seen._replace(keeps_to_step=self._keeps_to_step(bench, first))
         except _CannotStartAgainError as error:
             return seen._replace(restart=Restart.NEVER, failure=str(error))
         except PlantError as error:
             return seen._replace(failure=str(error))
+
+    def _keeps_to_step(self, bench: _Bench, first: Run) -> bool:
+        """Whether half a step ends elsewhere than a whole one, or two halves where it does.
+
+        A sampled plant, which moves at the begin of a sample and rests till the next, does the
+        latter; one that goes by a step of its own, whatever it is told, neither.
+        """
+        half = self.subject.step / 2
+        try:
+            halves = bench.run(self._inputs[:1] * 2, sizes=[half, half], spacing=half).samples
+        except PlantError:
+            bench.instantiate()
+            return True
+        whole = first.samples[0].states
+        return halves[0].states != whole or halves[1].states == whole
 
     def _misset(self, bench: _Bench) -> tuple[tuple[str, float, float], ...]:
         asked = [value for _, value in self.subject.starts]
@@ -559,6 +580,24 @@ class Probe:
             return Reading(Order.SET_STEP_GET)
         instant = Kind.INSTANT in kinds and Kind.FOLLOWS not in kinds
         return Reading(Order.GET_SET_STEP if instant else Order.SET_GET_STEP)
+
+    @property
+    def misfit(self) -> str:
+        """Why the FMU cannot be the plant as asked; empty if it can."""
+        findings, name = self.findings, f"FMU '{self.subject.fmu.path.name}'"
+        for start, asked, value in findings.misset:
+            return (
+                f"{name} was given {start} = {asked:g} and has {value:g} after its initialisation"
+            )
+        default = self.subject.fmu.description.defaultExperiment
+        step, own = self.subject.step, float(getattr(default, "stepSize", None) or 0.0)
+        if not findings.keeps_to_step and own and abs(step - own) > 1e-9 * own:
+            return (
+                f"{name} goes equally far however long a step is told to be, and its own step is "
+                f"{own:g} s by its default experiment, not {step:g} s: set sampling_time or "
+                "plant.communication_step to it"
+            )
+        return ""
 
     @property
     def cost_of_sample(self) -> bool:
@@ -715,6 +754,14 @@ def _report(seen: Probe, starts_anywhere: bool) -> Report:
             "" if starts_anywhere else "episodes start where the FMU does",
         ),
     ]
+    if not findings.keeps_to_step:
+        rows.append(
+            Row(
+                "step",
+                "goes equally far however long a step is told to be",
+                "sampling time or plant.communication_step must be the FMU's own step",
+            )
+        )
     if findings.failure:
         rows.append(Row("failure", findings.failure, "what it left open is taken as not possible"))
     return Report(

@@ -13,7 +13,7 @@ from tests.helpers.loop import Playback
 LAGGED, EAGER, NO_RESET, SHY, NEEDS_STOP, PART, HOLDS, DEAF, RESTLESS, MIXED, SLEEPY, ENABLED = (
     2**i for i in range(12)
 )
-HALF_LOUD, FREE = 4096, 8192
+HALF_LOUD, FREE, OWN_STEP, STUCK = 4096, 8192, 16384, 32768
 STEP, STEPS = 0.5, 8
 ACTIONS = np.array([2.0, 0.5, 1.0, 3.0, 0.25, 1.5, 2.5, 0.75])
 
@@ -208,6 +208,23 @@ def test_the_outputs_of_a_sample_of_several_steps_are_those_of_its_first(made, h
         states += [plant.step([u]).s[0] for u in np.repeat(ACTIONS, 4)]
     expected = (np.array(states)[end:-1:4][:STEPS] - 2.0) ** 2
     np.testing.assert_array_equal(costs, expected + (0.0 if habits == FREE else ACTIONS**2))
+
+
+def test_a_step_of_its_own_is_refused_unless_it_is_the_samples(tmp_path):
+    fmu = build_habits(tmp_path, experiment='<DefaultExperiment stepSize="0.25"/>')
+    with pytest.raises(PlantError, match=r"however long .* own step is 0\.25 s .*, not 0\.5 s"):
+        FmuPlant(habit_scenario(tmp_path, fmu, OWN_STEP))
+    fitting = habit_scenario(tmp_path, fmu, OWN_STEP, communication_step=0.25)
+    ordinary = habit_scenario(tmp_path, fmu, communication_step=0.25)
+    np.testing.assert_array_equal(driven(fitting)[0], driven(ordinary)[0])
+
+
+def test_a_step_that_came_nowhere_is_an_error(tmp_path):
+    fmu = build_habits(tmp_path, 3)
+    with FmuPlant(habit_scenario(tmp_path, fmu, STUCK)) as plant:
+        plant.reset(0)
+        with pytest.raises(PlantError, match="ended the step early, at 0"):
+            plant.step([1.0])
 
 
 def test_a_report_says_what_was_found(made):

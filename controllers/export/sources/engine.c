@@ -98,7 +98,7 @@ static int plant_step(const Plant *plant, double time, int *status) {
     typedef int (*Step2)(void *, double, double, int);
     typedef int (*Step3)(void *, double, double, _Bool, _Bool *, _Bool *, _Bool *, double *);
     _Bool event = 0, terminate = 0, early = 0;
-    double last = 0.0;
+    double last = INFINITY; /* where the FMU does not say how far it came */
     if (plant->order == GET_SET_STEP) {
         *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
         if (refused(*status)) return FAILED_GET;
@@ -117,7 +117,7 @@ static int plant_step(const Plant *plant, double time, int *status) {
                   : ((Step3)plant->step)(plant->component, time, plant->step_size,
                                          plant->no_return, &event, &terminate, &early, &last);
     if (refused(*status)) return FAILED_STEP;
-    if (terminate || early) return ENDED;
+    if (terminate || early || last < time + 0.5 * plant->step_size) return ENDED;
     if (plant->order == SET_STEP_GET) {
         *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
         if (refused(*status)) return FAILED_GET;

@@ -27,6 +27,8 @@ enum {
     ENABLED = 2048,   /* nothing moves unless the input `enable` is 1 */
     HALF_LOUD = 4096, /* a parameter that is set to 7 is 3 after the initialisation */
     FREE = 8192,      /* cost = (x - 2)^2, evaluated when it is asked for: no action enters */
+    OWN_STEP = 16384, /* each step is one of 0.25 s, whatever it is told */
+    STUCK = 32768,    /* FMI 3.0: doStep says that it came no further than its begin */
 };
 
 enum { U, X, COST, D, X_START, W, KEY, ENABLE, REALS };
@@ -67,6 +69,7 @@ static int end(Model *m) {
 
 static int step(Model *m, double h, bool no_return) {
     double *r = m->real;
+    if (has(m, OWN_STEP)) h = 0.25;
     const int count = (int)ceil(1.0 / sqrt(m->tolerance));
     const double length = (has(m, HOLDS) && !no_return ? 0.5 : 1.0) * h / count;
     if (has(m, LAGGED)) compute(m, 1);
@@ -188,7 +191,7 @@ fmi3Status fmi3SetInt32(fmi3Instance c, const unsigned vr[], size_t n, const int
 fmi3Status fmi3DoStep(fmi3Instance c, double t, double h, bool no_return, bool *event,
                       bool *terminate, bool *early, double *last) {
     *event = *terminate = *early = false;
-    *last = t + h;
+    *last = has(c, STUCK) ? t : t + h;
     return step(c, h, no_return);
 }
 fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *s) { return *s = save(*s, c), fmi3OK; }

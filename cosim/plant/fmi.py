@@ -286,7 +286,7 @@ class Experiment(NamedTuple):
 
 
 Intermediate = Callable[[float, NDArray[np.float64]], None]
-"""Called with the time [s] and the states (n,) at each internal step of an FMU."""
+"""Called with the time since the reset [s] and the states (n,) at each internal step of an FMU."""
 
 
 def _as(buffer: Any, value: float) -> float:

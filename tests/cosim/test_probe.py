@@ -13,7 +13,7 @@ from tests.helpers.loop import Playback
 LAGGED, EAGER, NO_RESET, SHY, NEEDS_STOP, PART, HOLDS, DEAF, RESTLESS, MIXED, SLEEPY, ENABLED = (
     2**i for i in range(12)
 )
-HALF_LOUD, FREE, OWN_STEP, STUCK = 4096, 8192, 16384, 32768
+HALF_LOUD, FREE, OWN_STEP, STUCK, FRAIL = 4096, 8192, 16384, 32768, 65536
 STEP, STEPS = 0.5, 8
 ACTIONS = np.array([2.0, 0.5, 1.0, 3.0, 0.25, 1.5, 2.5, 0.75])
 
@@ -235,6 +235,11 @@ def test_a_report_says_what_was_found(made):
     assert report.undriven == {"enable": "0"}
     assert report.starts_anywhere
     assert all(row.subject and row.found for row in report.rows)
+
+
+def test_an_fmu_that_bears_small_changes_only_is_tried_with_those(made):
+    assert probe(made(FRAIL)).kinds == {"cost": Kind.FOLLOWS, "d": Kind.INSTANT}
+    assert probe(made(FRAIL | LAGGED)).kinds == {"cost": Kind.SAMPLE, "d": Kind.SAMPLE}
 
 
 def test_a_plant_with_noise_of_its_own_is_read_in_the_order_that_fmi_allows(made):

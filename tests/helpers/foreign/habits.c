@@ -28,6 +28,7 @@ enum {
     HALF_LOUD = 4096, /* a parameter that is set to 7 is 3 after the initialisation */
     FREE = 8192,      /* cost = (x - 2)^2, evaluated when it is asked for: no action enters */
     OWN_STEP = 16384, /* each step is one of 0.25 s, whatever it is told */
+    FRAIL = 65536,    /* doStep fails where u is above 1.1 */
     STUCK = 32768,    /* FMI 3.0: doStep says that it came no further than its begin */
 };
 
@@ -72,6 +73,7 @@ static int step(Model *m, double h, bool no_return) {
     if (has(m, OWN_STEP)) h = 0.25;
     const int count = (int)ceil(1.0 / sqrt(m->tolerance));
     const double length = (has(m, HOLDS) && !no_return ? 0.5 : 1.0) * h / count;
+    if (has(m, FRAIL) && r[U] > 1.1) return 3;
     if (has(m, LAGGED)) compute(m, 1);
     if (has(m, MIXED)) compute(m, 0);
     for (int i = 0; i < count; i++) {

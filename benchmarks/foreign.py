@@ -13,7 +13,7 @@ from pathlib import Path
 from cosim import FmuPlant, Scenario
 from cosim.errors import CosimError
 from cosim.plant.fmi import unpack
-from cosim.plant.fmu_plant import refusals
+from cosim.plant.wiring import refusals
 from cosim.result import markdown_table
 
 SAMPLES, STEP = 20, 0.1

@@ -101,6 +101,19 @@ class PlantTable(Table):
     """Further start values, by variable, that each reset writes."""
     communication_step: Positive | None = None
     """Communication step in s, a divisor of the sampling time; without it the sampling time."""
+    outputs: Literal["before-step", "after-step"] | None = None
+    """When stage cost and disturbances of a sample are read.
+
+    `before-step`: at its begin, after the actions are set, which asks for an FMU whose outputs
+    follow them at once. `after-step`: after its (first) communication step, for an FMU whose
+    doStep computes them. Without it the plant finds it out, each output for itself.
+    """
+    start_time: Number | None = None
+    """The FMU's time at k = 0 in s; without it that of its default experiment, else 0."""
+    stop_time: Number | None = None
+    """The FMU's time in s beyond which no step goes; without it the FMU is told of none."""
+    tolerance: Positive | None = None
+    """Relative tolerance of the FMU's solver; without it that of its default experiment."""
     changes: Annotated[tuple[ChangeTable, ...], Field(strict=False)] | None = None
     """Tables `[[plant.changes]]`: what changes in mid run, times increasing."""
     model: Annotated[str, Field(pattern=r"^[\w.]+:\w+$")] | None = None
@@ -309,6 +322,9 @@ class Scenario(Shown, Table):
         steps = self.sampling_time / (plant.communication_step or self.sampling_time)
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
             raise ValueError("plant.communication_step: must be a divisor of sampling_time")
+        start, stop = plant.start_time, plant.stop_time
+        if start is not None and stop is not None and stop <= start:
+            raise ValueError("plant.stop_time: must be after plant.start_time")
         times = [change.time for change in plant.changes or ()]
         if any(first >= second for first, second in pairwise(times)):
             raise ValueError("plant.changes: must have increasing times")

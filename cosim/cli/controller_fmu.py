@@ -15,7 +15,7 @@ from controllers.theta import ThetaBlocks
 from cosim.errors import ControllerLookupError
 from cosim.files import write_atomically
 from cosim.plant.fmi import unpack
-from cosim.plant.fmu_plant import start_values
+from cosim.plant.wiring import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds

@@ -31,7 +31,7 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     with output(json) as out_:
         from cosim.errors import PlantError
         from cosim.plant.fmi import unpack
-        from cosim.plant.fmu_plant import refusals
+        from cosim.plant.wiring import refusals
         from fmus.check import information
 
         try:

@@ -10,6 +10,7 @@ import typer
 
 import cosim
 from cosim.cli import output as cli
+from cosim.scenario import is_file
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming import Optimum, Progress
@@ -37,6 +38,10 @@ def optimum(
         from controllers.optimum import QuasiStaticPolicy, change_of
 
         task = cli.load_scenario(scenario)
+        if is_file(task.plant.fmu):
+            out_.announce(task.plant.fmu)
+            with cosim.FmuPlant(task) as plant:
+                plant.require_cost_of_sample()
         if change_of(task) is not None:
             policy = QuasiStaticPolicy.from_scenario(task, progress=_told(out_))
             _show_quasi_static(policy, task, out_)

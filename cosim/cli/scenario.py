@@ -65,7 +65,7 @@ def show(
 
 
 def _seed_values(scenario: cosim.Scenario, seed: int) -> dict[str, float | bool | int]:
-    from cosim.plant.fmu_plant import REALS, start_values
+    from cosim.plant.wiring import REALS, start_values
     from cosim.simulation import spawn_seeds
 
     types: dict[str, Callable[[float], float | bool | int]] = dict.fromkeys(REALS, float)

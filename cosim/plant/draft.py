@@ -15,7 +15,8 @@ from scipy.optimize import least_squares
 
 from cosim.errors import PlantError
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, unpack
-from cosim.plant.fmu_plant import INTEGERS, REALS, FmuPlant, has_start, refusals
+from cosim.plant.fmu_plant import FmuPlant
+from cosim.plant.wiring import INTEGERS, REALS, has_start, refusals
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion

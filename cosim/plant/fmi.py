@@ -15,7 +15,9 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
+from math import inf
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
@@ -230,8 +232,7 @@ def library_path(fmu: UnpackedFmu) -> Path:
     )
 
 
-OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
-ACCEPTED = frozenset((OK, WARNING))
+WARNING, DISCARD, FATAL = 1, 2, 4
 _STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 # fmpy changes the working directory while it loads a library.
@@ -250,8 +251,42 @@ class Place(NamedTuple):
     starts: tuple[float, ...] = (0.0,)
 
 
+class Order(IntEnum):
+    """When a step reads the outputs; the numbers are those of the controllers' `engine.c`.
+
+    FMI 2.0.5 (p. 109) forbids to get after a set without a step in between, and FMI 3.0 says that
+    such a get returns what it returned before the set. `SET_GET_STEP` is therefore for those FMUs
+    alone that were seen to answer it.
+    """
+
+    SET_GET_STEP = 0
+    """After the inputs are set and before the step, for outputs that follow the inputs at once."""
+    GET_SET_STEP = 1
+    """Before the inputs are set, for outputs of state, time or noise alone; allowed everywhere."""
+    SET_STEP_GET = 2
+    """After the step, for outputs that the step computes; allowed everywhere."""
+
+
+class Reading(NamedTuple):
+    """When the outputs are read: in one order, but for those of numbers `late`, after the step."""
+
+    order: Order
+    late: tuple[int, ...] = ()
+
+
+class Experiment(NamedTuple):
+    """What an FMU is told of the simulation as it starts; None is not told."""
+
+    start_time: float = 0.0
+    """Time of the first sample in s."""
+    stop_time: float | None = None
+    """Time in s beyond which no step goes."""
+    tolerance: float | None = None
+    """Relative tolerance of the FMU's own solver."""
+
+
 Intermediate = Callable[[float, NDArray[np.float64]], None]
-"""Called with the time [s] and the states (n,) at each internal step of an FMU."""
+"""Called with the time since the reset [s] and the states (n,) at each internal step of an FMU."""
 
 
 def _as(buffer: Any, value: float) -> float:
@@ -268,7 +303,10 @@ class Native(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("inputs", "outputs", "states")),
         *((name, ctypes.c_size_t) for name in ("n_inputs", "n_outputs", "n_states")),
         *((name, ctypes.c_void_p) for name in ("input", "output", "state")),
+        ("start_time", ctypes.c_double),
         ("step_size", ctypes.c_double),
+        ("order", ctypes.c_int),
+        ("no_return", ctypes.c_int),
     ]
 
 
@@ -292,8 +330,6 @@ class Instance(ABC):
     _state: ClassVar[str]
     """FMI's name of a saved state."""
     _deserialise: ClassVar[str]
-    _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
-    """The calls that initialise, with their arguments after the instance."""
 
     def __init__(
         self,
@@ -301,6 +337,8 @@ class Instance(ABC):
         exchanged: tuple[Sequence[Place], Sequence[Place], Sequence[Place]],
         starts: Sequence[tuple[Place, float]],
         step_size: float,
+        reading: Reading,
+        experiment: Experiment,
         intermediate: Intermediate | None,
     ) -> None:
         self.fmu = fmu
@@ -317,8 +355,14 @@ class Instance(ABC):
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._functions: dict[str, Any] = {}
-        self.drivable = all(map(self._all_real, self._places))
+        self.drivable = all(map(self._all_real, self._places)) and not reading.late
+        self.experiment = experiment
+        self._order = reading.order
         self._step_size = ctypes.c_double(step_size)
+        self.no_return: Any = ctypes.c_int(1)
+        """Whether no snapshot may take the FMU back to before its present time: an FMU may have to
+        hold on to its past for that (noSetFMUStatePriorToCurrentPoint).
+        """
         self._time = ctypes.c_double(0.0)
         self.inputs, self._set_inputs = self._exchange(inputs, "Set")
         self.outputs, self._get_outputs = self._exchange(outputs, "Get")
@@ -326,7 +370,9 @@ class Instance(ABC):
         self.outputs_view: NDArray[np.float64] = np.frombuffer(memoryview(self.outputs))
         self.states_view: NDArray[np.float64] = np.frombuffer(memoryview(self.states))
         self._do_step = self._function("DoStep")
-        places = [place for place, _ in starts]
+        self._first, self._second, self._third = self._calls_of_a_step(reading)
+        self._to_start = self._calls_to_start()
+        self._start_places = places = [place for place, _ in starts]
         self._starts, self._set_starts = self._exchange(places, "Set")
         self._starts[:] = [value for _, value in starts]
         # FMI 2 counts value references anew for each type.
@@ -340,6 +386,10 @@ class Instance(ABC):
     @abstractmethod
     def _step_arguments(self) -> tuple[Any, ...]:
         """The arguments of a step, the instance first."""
+
+    @abstractmethod
+    def _calls_to_start(self) -> tuple[tuple[str, tuple[Any, ...]], ...]:
+        """The calls that initialise, with their arguments after the instance."""
 
     @abstractmethod
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
@@ -375,7 +425,7 @@ class Instance(ABC):
 
     def _call(self, name: str, *arguments: Any) -> None:
         """Call a function of FMI; raises PlantError where it fails."""
-        if (status := self._function(name)(*arguments)) not in ACCEPTED:
+        if (status := self._function(name)(*arguments)) and status != WARNING:
             self.fail(name, status)
 
     def initialise(self, started: bool) -> None:
@@ -384,18 +434,71 @@ class Instance(ABC):
             self._call("Reset", self._component)
         if self._starts:
             self._set_starts()
-        for name, arguments in self._begin:
+        for name, arguments in self._to_start:
             self._call(name, self._component, *arguments)
         self._get_states()
 
     def advance(self, time: float) -> None:
-        """Write the inputs, read the outputs at `time`, step, and read the states after it."""
+        """Write the inputs, step from `time` [s] on, read the states after it.
+
+        The outputs are read before or after the step, as the instance was told.
+        """
         self._time.value = time
+        self._first()
+        self._second()
+        if (status := self._do_step(*self._step_arguments)) and status != WARNING:
+            self.fail("DoStep", status)
+        self._third()
+
+    def write_inputs(self, values: Sequence[float]) -> None:
+        """Set the inputs, one number of each; for a probe, which takes a step in its parts."""
+        self.inputs[:] = values
         self._set_inputs()
+
+    def read_outputs(self) -> list[float]:
+        """Read the outputs as they are now."""
         self._get_outputs()
-        if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
+        return list(self.outputs)
+
+    def take_step(self, time: float, size: float) -> list[float]:
+        """Step from `time` by `size` [s], and nothing else; return the states after it."""
+        self._time.value, self._step_size.value = time, size
+        if (status := self._do_step(*self._step_arguments)) and status != WARNING:
             self.fail("DoStep", status)
         self._get_states()
+        return list(self.states)
+
+    def read_starts(self) -> list[float]:
+        """The start values as the FMU has them after it was initialised, in the order given."""
+        values, read = self._exchange(self._start_places, "Get")
+        read()
+        return list(values)
+
+    def _calls_of_a_step(self, reading: Reading) -> tuple[Callable[[], None], ...]:
+        """What is called before the step, first and second, and after it."""
+        set_inputs, get_outputs, get_states = self._set_inputs, self._get_outputs, self._get_states
+        if reading.order is Order.SET_STEP_GET:
+
+            def get_all() -> None:
+                get_outputs()
+                get_states()
+
+            return set_inputs, _nothing, get_all
+        before = (set_inputs, get_outputs)
+        if reading.order is Order.GET_SET_STEP:
+            before = (get_outputs, set_inputs)
+        if not reading.late:
+            return *before, get_states
+        late, outputs = reading.late, self.outputs
+        values, get_late = self._exchange([self._places[1][i] for i in late], "Get")
+
+        def get_late_and_states() -> None:
+            get_late()
+            for i, value in zip(late, values, strict=True):
+                outputs[i] = value
+            get_states()
+
+        return *before, get_late_and_states
 
     def _exchange(self, places: Sequence[Place], verb: str) -> tuple[Any, Callable[[], None]]:
         """A buffer for a number of each place, and a function that sets or gets them all."""
@@ -406,7 +509,7 @@ class Instance(ABC):
             arguments = self._arguments([place.reference for place in places], buffer)
 
             def exchange() -> None:
-                if (status := function(*arguments)) not in ACCEPTED:
+                if (status := function(*arguments)) and status != WARNING:
                     self.fail(name, status)
 
             return buffer, exchange
@@ -446,9 +549,17 @@ class Instance(ABC):
         """Whether they are FMI's reals, none in an array: compiled code can exchange those."""
         return all(place.type == self.real and len(place.starts) == 1 for place in places)
 
-    @cached_property
+    @property
     def native(self) -> Native:
-        """The instance's functions and buffers for compiled code, which calls them directly."""
+        """The instance's functions and buffers for compiled code, which calls them directly.
+
+        It holds for the moment: a snapshot that comes or goes changes `no_return`.
+        """
+        self._native.no_return = self.no_return.value
+        return self._native
+
+    @cached_property
+    def _native(self) -> Native:
         buffers = (self.inputs, self.outputs, self.states)
         # Keep them: compiled code has only their addresses.
         self._references = [
@@ -463,7 +574,10 @@ class Instance(ABC):
             *(ctypes.cast(each, ctypes.c_void_p) for each in self._references),
             *(len(each) for each in buffers),
             *(ctypes.cast(each, ctypes.c_void_p) for each in buffers),
+            self.experiment.start_time,
             self._step_size.value,
+            self._order,
+            self.no_return.value,
         )
 
     def fail_native(self, fault: int, status: int) -> None:
@@ -474,9 +588,16 @@ class Instance(ABC):
             status = DISCARD
         self.fail(names[fault - 1], status)
 
+    def require_state(self) -> None:
+        """Raise CapabilityError unless the FMU declares that its state can be saved and set."""
+        self._require("canGetAndSetFMUstate", "save and restore its state")
+
+    def require_serialised_state(self) -> None:
+        """Raise CapabilityError unless the FMU declares that a saved state can be serialised."""
+        self._require("canSerializeFMUstate", "serialise its state")
+
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
-        self._require("canGetAndSetFMUstate", "save and restore its state")
         self._call(f"Get{self._state}", self._component, ctypes.byref(handle))
 
     def load(self, handle: ctypes.c_void_p) -> None:
@@ -486,7 +607,7 @@ class Instance(ABC):
 
     def serialise(self, handle: ctypes.c_void_p) -> bytes:
         """Return a saved state as bytes that any instance of this FMU can read."""
-        self._require("canSerializeFMUstate", "serialise its state")
+        self.require_serialised_state()
         size = ctypes.c_size_t()
         arguments = (self._component, handle)
         self._call(f"Serialized{self._state}Size", *arguments, ctypes.byref(size))
@@ -496,7 +617,7 @@ class Instance(ABC):
 
     def deserialise(self, data: bytes, handle: ctypes.c_void_p) -> None:
         """Fill a handle from bytes; raises PlantError if the FMU refuses them."""
-        self._require("canSerializeFMUstate", "serialise its state")
+        self.require_serialised_state()
         buffer = ctypes.create_string_buffer(data, len(data))
         size = ctypes.c_size_t(len(data))
         self._call(self._deserialise, self._component, buffer, size, ctypes.byref(handle))
@@ -536,6 +657,10 @@ class Instance(ABC):
         free(self._component)
 
 
+def _nothing() -> None:
+    """Take the place of a call that is not needed."""
+
+
 _numbers = itertools.count()
 _logs: WeakValueDictionary[bytes, deque[str]] = WeakValueDictionary()
 
@@ -555,8 +680,10 @@ _callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
 _callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
 addLoggerProxy(ctypes.byref(_callbacks))
 
-_FALSE = ctypes.c_int(0)
-_ZERO = ctypes.c_double(0.0)
+
+def _told(value: float | None, truth: Any) -> tuple[Any, Any]:
+    """FMI's two arguments of a value that may be undefined: whether it is defined, and it."""
+    return truth(value is not None), ctypes.c_double(0.0 if value is None else value)
 
 
 class Fmi2Instance(Instance):
@@ -572,16 +699,19 @@ class Fmi2Instance(Instance):
     }
     _state = "FMUstate"
     _deserialise = "DeSerializeFMUstate"
-    _begin = (
-        ("SetupExperiment", (_FALSE, _ZERO, _ZERO, _FALSE, _ZERO)),
-        ("EnterInitializationMode", ()),
-        ("ExitInitializationMode", ()),
-    )
+
+    def _calls_to_start(self) -> tuple[tuple[str, tuple[Any, ...]], ...]:
+        start, stop, tolerance = self.experiment
+        given = (*_told(tolerance, ctypes.c_int), ctypes.c_double(start))
+        return (
+            ("SetupExperiment", (*given, *_told(stop, ctypes.c_int))),
+            ("EnterInitializationMode", ()),
+            ("ExitInitializationMode", ()),
+        )
 
     @cached_property
     def _step_arguments(self) -> tuple[Any, ...]:
-        # The last argument is false: a snapshot may take the FMU back before this step.
-        return (self._component, self._time, self._step_size, _FALSE)
+        return (self._component, self._time, self._step_size, self.no_return)
 
     def _instantiate(self, **where: Any) -> Any:
         name = f"cosim-{next(_numbers)}"
@@ -594,9 +724,6 @@ class Fmi2Instance(Instance):
         count = len(references)
         pointers = (ctypes.c_uint * count)(*references)
         return (self._component, pointers, ctypes.c_size_t(count), values)
-
-
-_NO = ctypes.c_bool(False)
 
 
 class Fmi3Instance(Instance):
@@ -613,19 +740,24 @@ class Fmi3Instance(Instance):
     } | {"Enumeration": ("Int64", fmi3.fmi3Int64)}  # fmt: skip
     _state = "FMUState"
     _deserialise = "DeserializeFMUState"
-    _begin = (
-        ("EnterInitializationMode", (_NO, _ZERO, _ZERO, _NO, _ZERO)),
-        ("ExitInitializationMode", ()),
-    )
     _raised: BaseException | None
+
+    def _calls_to_start(self) -> tuple[tuple[str, tuple[Any, ...]], ...]:
+        start, stop, tolerance = self.experiment
+        given = (*_told(tolerance, ctypes.c_bool), ctypes.c_double(start))
+        return (
+            ("EnterInitializationMode", (*given, *_told(stop, ctypes.c_bool))),
+            ("ExitInitializationMode", ()),
+        )
 
     @cached_property
     def _step_arguments(self) -> tuple[Any, ...]:
         event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
-        self._last_time = ctypes.c_double()
+        # Infinite where an FMU does not say how far it came.
+        self._last_time = ctypes.c_double(inf)
         found = (event, self._terminate, self._early, self._last_time)
-        # _NO: a snapshot may take the FMU back before this step.
-        given = (self._component, self._time, self._step_size, _NO)
+        self.no_return = ctypes.c_bool(self.no_return.value)
+        given = (self._component, self._time, self._step_size, self.no_return)
         return (*given, *(ctypes.byref(each) for each in found))
 
     def _instantiate(self, **where: Any) -> Any:
@@ -674,6 +806,18 @@ class Fmi3Instance(Instance):
         super().advance(time)
         if self._raised is not None:
             raise self._raised
-        if self._terminate.value or self._early.value:
-            self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
+        self._check_end(time + 0.5 * self._step_size.value)
+
+    def take_step(self, time: float, size: float) -> list[float]:
+        """Step as in FMI 2.0; an FMU that ends the step early is an error."""
+        self._raised = None
+        states = super().take_step(time, size)
+        self._check_end(time + 0.5 * size)
+        return states
+
+    def _check_end(self, least: float) -> None:
+        """Raise PlantError where a step ended early; `least` [s] is a time that it had to pass."""
+        last = self._last_time.value
+        if self._terminate.value or self._early.value or last < least:
+            self.messages.append(f"the FMU ended the step early, at {last} s")
             self.fail("DoStep", DISCARD)

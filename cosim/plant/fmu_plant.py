@@ -3,233 +3,22 @@
 from __future__ import annotations
 
 import ctypes
-import operator
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, inf, isfinite, prod
+from math import inf, isfinite
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import NoReturn, Self
 
 import numpy as np
 
 from cosim.errors import CapabilityError, PlantError
-from cosim.plant.fmi import (
-    NOT_FINITE,
-    Fmi2Instance,
-    Fmi3Instance,
-    Instance,
-    Intermediate,
-    Place,
-    UnpackedFmu,
-    library_path,
-    unpack,
-)
+from cosim.plant.fmi import NOT_FINITE, Instance, Intermediate, unpack
+from cosim.plant.probe import Restart, as_asked, probe_of, subject_of
+from cosim.plant.wiring import Wiring, refusals, seed_words
 from cosim.protocols import Array, CompiledLoop, Step
 from cosim.scenario import Scenario
-from cosim.validation import known_keywords, suggestion
-
-REALS = ("Real", "Float64", "Float32")
-
-
-def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
-    """Every reason for which `FmuPlant` refuses the FMU, as its error message says it.
-
-    One is a communication `step` [s] that is no multiple of a fixed internal step;
-    canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
-    """
-    description, name = fmu.description, f"FMU '{fmu.path}'"
-    simulation = description.coSimulation
-    if simulation is None:
-        faces = {
-            "model exchange": description.modelExchange,
-            "scheduled execution": description.scheduledExecution,
-        }
-        others = ", ".join(words for words, face in faces.items() if face is not None)
-        yield f"{name} has no co-simulation interface (it has: {others or 'none'})"
-    else:
-        try:
-            library_path(fmu)
-        except PlantError as error:
-            yield str(error)
-        internal = float(simulation.fixedInternalStepSize or 0)
-        count = step / internal if step and internal > 0 else 1.0
-        if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
-            yield (
-                f"{name} steps by multiples of {internal:g} s (fixedInternalStepSize), and the "
-                f"communication step of {step:g} s is none"
-            )
-    numbers = [v for v in description.modelVariables if v.type not in _NO_NUMBERS]
-    if not any(v.causality == "input" or v.variability == "tunable" for v in numbers):
-        yield (
-            f"{name} has no input and no tunable parameter that is a number: there is nothing for "
-            "a controller to act on"
-        )
-    if not any(v.causality in ("output", "local") for v in numbers):
-        yield f"{name} has no output that is a number: there is nothing for a controller to see"
-
-
-_WIDE = ("Int64", "UInt64")
-INTEGERS = ("Integer", "Int32", "UInt32", *_WIDE)
-_NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
-
-
-def has_start(variable: Any) -> bool:
-    """Whether an importer may set the variable's start value, by FMI's causality and `initial`."""
-    if variable.variability == "constant":
-        return False
-    if variable.causality in ("output", "local"):
-        return variable.initial in ("exact", "approx")
-    return variable.causality not in ("calculatedParameter", "independent")
-
-
-class Wiring:
-    """Places in an FMU of the variables that a scenario names; raises PlantError on any misfit.
-
-    They are `inputs`, `outputs` (stage cost first), `states`, the `seeds`, low word first, the
-    parameters for the `initial` state, and all `starts` with their values.
-    """
-
-    def __init__(self, scenario: Scenario, fmu: UnpackedFmu) -> None:
-        self._scenario, self._fmu, plant = scenario, fmu, scenario.plant
-        self.interface = Fmi2Instance if fmu.description.fmiVersion[0] == "2" else Fmi3Instance
-        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
-        self.outputs = self._numbers((plant.stage_cost, *plant.disturbances), "plant")
-        self.states = self._numbers(plant.states, "plant.states")
-        self.initial = self._numbers(plant.mapping.initial_state, "plant.mapping.initial_state")
-        self.seeds: list[Place] = []
-        for name in plant.mapping.seed:
-            if not (self.seeds and self.seeds[-1].type in _WIDE):
-                self.seeds.append(self._place(name, "plant.mapping.seed", _no_word))
-        self.starts = self._starts()
-
-    def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
-        """By the number of a sample the places to write at its start, and the values."""
-        scenario = self._scenario
-        found: dict[int, tuple[list[Place], list[float]]] = {}
-        for change in scenario.plant.changes or ():
-            places, values = found.setdefault(ceil(change.time / scenario.sampling_time), ([], []))
-            for name, value in change.parameters.items():
-                places.append(self._place(name, "plant.changes", _not_written))
-                values.append(value)
-        return found
-
-    def _numbers(self, names: Sequence[str], table: str) -> list[Place]:
-        return [self._place(name, table, _no_number) for name in names]
-
-    def _starts(self) -> list[tuple[Place, float]]:
-        scenario, mapping = self._scenario, self._scenario.plant.mapping
-        law, codes = scenario.disturbance, mapping.law_codes
-        fields: dict[str, tuple[str | Sequence[str] | None, Sequence[float]]] = {
-            "initial_state": (mapping.initial_state, scenario.plant.initial_state),
-            "sampling_time": (mapping.sampling_time, [scenario.sampling_time]),
-            "stochastic": (mapping.stochastic, [float(law.law != "none")]),
-            "law": (mapping.law, [codes[law.law]] if law.law in codes else []),
-            "nominal": (mapping.nominal, law.nominal),
-            "ranges": (mapping.ranges, law.ranges),
-        }
-        starts = []
-        for field, (names, values) in fields.items():
-            listed = [names] if isinstance(names, str) else names or ()
-            # Either may be left out; the scenario has checked that they fit.
-            for name, value in zip(listed, values, strict=False):
-                starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
-        for name, value in scenario.plant.parameters.items():
-            starts.append(self._start_value(name, float(value), "plant.parameters"))
-        return starts + [(place, 0.0) for place in self.seeds]
-
-    def _start_value(self, name: str, value: float, table: str) -> tuple[Place, float]:
-        def misfit(variable: Any) -> str:
-            if variable.type not in self.interface.setters:
-                return f"is {_a(variable.type)}, which cannot be set here"
-            if variable.type not in REALS and value != int(value):
-                return f"is {_a(variable.type)} and cannot take {value}"
-            if not has_start(variable):
-                return f"is {_a(variable.causality)} without a start to set"
-            return ""
-
-        return self._place(name, table, misfit), value
-
-    def _place(self, name: str, table: str, misfit: Callable[[Any], str]) -> Place:
-        """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is.
-
-        `misfit` says what is wrong with a variable, if anything.
-        """
-        fmu, asked = self._fmu, f"{table} of scenario '{self._scenario.name}' names"
-        if (variable := fmu.variable(name)) is None:
-            raise PlantError(
-                f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}, "
-                f"which {asked}"
-            )
-        what, shape, index = misfit(variable), tuple(variable.shape or ()), 0
-        if shape and not what:
-            try:
-                indices = name.removeprefix(variable.name).removeprefix("[").removesuffix("]")
-                index = int(np.ravel_multi_index([int(i) for i in indices.split(",")], shape))
-            except ValueError:
-                last = ",".join(str(n - 1) for n in shape)
-                what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
-        if what:
-            raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
-        stated = ["0"] if variable.type in _NO_NUMBERS else str(variable.start or 0).split()
-        starts = tuple(map(float, stated)) * (prod(shape) // len(stated))
-        return Place(int(variable.valueReference), str(variable.type), index, starts)
-
-
-def _no_number(variable: Any) -> str:
-    return f"is {_a(variable.type)}, not a number" if variable.type in _NO_NUMBERS else ""
-
-
-def _not_written(variable: Any) -> str:
-    if variable.causality != "input" and variable.variability != "tunable":
-        return f"is {_a(variable.causality)}, not an input, and is not tunable"
-    return _no_number(variable)
-
-
-def _no_word(variable: Any) -> str:
-    what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
-    return "" if variable.type in INTEGERS else what
-
-
-def _a(noun: str) -> str:
-    return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
-
-
-def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
-    """A seed's words for the `places` of `Wiring.seeds`, each with its own.
-
-    Raises PlantError for anything but an integer in [0, 2⁶⁴).
-    """
-    try:
-        number = operator.index(seed)
-    except TypeError:
-        number = -1
-    if not 0 <= number < 1 << 64:
-        raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
-    words, shift = [], 0
-    for place in places:
-        bits = 64 if place.type in _WIDE else 32
-        words.append((place, number >> shift & (1 << bits) - 1))
-        shift += bits
-    return words
-
-
-def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, float]]:
-    """FMI type and value of each parameter that differs by scenario, the seed's words too.
-
-    `plant_seed`, 64 bits, is the first of `cosim.simulation.spawn_seeds`; an Integer, which has
-    32 bits and a sign, takes its low word, the next one the high word. Raises PlantError where the
-    scenario's FMU does not fit it.
-    """
-    fmu = unpack(scenario.plant.fmu)
-    wiring = Wiring(scenario, fmu)
-    names = {(int(v.valueReference), v.type): name for name, v in fmu.variables.items()}
-    found = {names[place[:2]]: (place.type, value) for place, value in wiring.starts}
-    for place, value in seed_words(plant_seed, wiring.seeds):
-        signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
-        found[names[place[:2]]] = (place.type, signed)
-    return found
-
+from cosim.validation import known_keywords
 
 _NOT_STARTED = -1
 _HEADER = struct.Struct("<q32s")
@@ -243,20 +32,22 @@ class Snapshot:
     """
 
     plant: FmuPlant
+    instance: Instance
     handle: ctypes.c_void_p
     k: int
 
     def __del__(self) -> None:
-        self.plant.recycle(self.handle)
+        self.plant.recycle(self.instance, self.handle)
 
 
 class FmuPlant:
     """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
 
-    At sample k, time k·h, the action is written, and ℓ(x_k, u_k, d_k) and d_k are read. Then the
-    FMU steps by the sampling time h, at once or by `plant.communication_step`, and x_{k+1} is
-    read. Use it as a context manager, or call `close`. An FMU is native code: name only files that
-    you trust.
+    At sample k, time k·h, the action is written, and ℓ(x_k, u_k, d_k) and d_k are read, before or
+    after the step as the FMU needs it (`cosim.plant.probe`). The FMU steps by the sampling time h,
+    at once or by `plant.communication_step`, and x_{k+1} is read. The FMU's own time is
+    `plant.start_time` + k·h. Use it as a context manager, or call `close`. An FMU is native code:
+    name only files that you trust.
 
     `scenario` is a `Scenario` or what `Scenario.load` takes; `fmu`, a shipped one's name or a path,
     replaces the scenario's. `intermediate` is called with time [s] and states (n,) after each
@@ -295,23 +86,65 @@ class FmuPlant:
         self.state_range = lower, upper
         self.penalty = self.scenario.state_penalty
         self._seeds, self._initial = wiring.seeds, wiring.initial
+        self._asked = list(plant.initial_state)
         self._elsewhere = False
         self._m = len(plant.actions)
         self._k = _NOT_STARTED
-        self._started = False
+        self._started = self._saves = False
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
-        exchanged = wiring.inputs, wiring.outputs, wiring.states
-        step = self._h / self._steps
-        self._fmi = wiring.interface(archive, exchanged, wiring.starts, step, intermediate)
-        self.drivable = self._fmi.drivable and self._steps == 1 and intermediate is None
-        self._changes = {k: self._fmi.writer(*change) for k, change in wiring.changes().items()}
-        self._advance = self._fmi.advance if self._steps == 1 else self._advance_in_steps
-        self._inputs = self._fmi.inputs
-        self._outputs = self._fmi.outputs
-        self._states = self._fmi.states
-        self._copy_states = self._fmi.states_view.copy
-        self._copy_disturbances = self._fmi.outputs_view[1:].copy
+        self._wiring, self._intermediate = wiring, intermediate
+        self._probe = probe_of(subject_of(self.scenario, archive, wiring))
+        self._reading = self._probe.reading
+        if plant.outputs is not None:
+            self._reading = self._probe.stated(plant.outputs)
+        if plant.model is not None:
+            self.require_cost_of_sample()
+        if self._probe.misfit:
+            raise PlantError(self._probe.misfit)
+        self._resets = self._probe.findings.restart is Restart.RESET
+        self._start_time = self._probe.findings.experiment.start_time
+        self._instantiate()
+
+    def require_cost_of_sample(self) -> None:
+        """Refuse what is compared with the optimum, where the stage cost is of another instant.
+
+        Raises:
+            PlantError: The stage cost that the FMU gives is that of the end of a step; the optimum
+                is for ℓ(x_k, u_k, d_k).
+        """
+        if not self._probe.cost_of_sample:
+            raise PlantError(
+                f"'{self.scenario.plant.stage_cost}' of FMU '{self.fmu_path.name}' is known at the "
+                "end of a step only, and the optimum is for the cost at a sample's begin: there is "
+                "no J* of this plant (leave plant.model out)"
+            )
+
+    def _instantiate(self) -> None:
+        """Make an instance of the FMU, and look up what a step uses of it."""
+        wiring = self._wiring
+        fmi = self._fmi = wiring.interface(
+            self.unpacked,
+            (wiring.inputs, wiring.outputs, wiring.states),
+            wiring.starts,
+            self._h / self._steps,
+            self._reading,
+            self._probe.findings.experiment,
+            self._intermediate and self._since_reset,
+        )
+        self.drivable = fmi.drivable and self._steps == 1 and self._intermediate is None
+        self._changes = {k: fmi.writer(*change) for k, change in wiring.changes().items()}
+        self._advance = fmi.advance if self._steps == 1 else self._advance_in_steps
+        self._inputs = fmi.inputs
+        self._outputs = fmi.outputs
+        self._states = fmi.states
+        self._copy_states = fmi.states_view.copy
+        self._copy_disturbances = fmi.outputs_view[1:].copy
+
+    def _since_reset(self, time: float, states: Array) -> None:
+        """Tell of an internal step, at its time since the reset."""
+        assert self._intermediate is not None
+        self._intermediate(time - self._start_time, states)
 
     @property
     def k(self) -> int:
@@ -320,7 +153,7 @@ class FmuPlant:
 
     @property
     def time(self) -> float:
-        """Time k·h in s, not accumulated."""
+        """Time since the reset, k·h in s, not accumulated."""
         return self._k * self._h
 
     @property
@@ -334,16 +167,45 @@ class FmuPlant:
         `initial_state` (n,) replaces the scenario's for this episode. Every start value is written.
         """
         fmi = self._instance
-        for place, word in seed_words(seed, self._seeds):
+        words = seed_words(seed, self._seeds)
+        if self._started and not self._resets:
+            fmi = self._begin_anew()
+        for place, word in words:
             fmi.change_start(place, word)
         if initial_state is not None or self._elsewhere:
             self._start_from(fmi, initial_state)
         self._k = _NOT_STARTED
         fmi.initialise(self._started)
+        if self._initial and self._states[:] != self._asked:
+            self._check_initial_state()
         self._started = True
         self._k = 0
         self._penalty_now = self.penalty(self._states[:])
         return self._copy_states()
+
+    def _begin_anew(self) -> Instance:
+        """Take a new instance for an episode, where a reset was not seen to repeat the start."""
+        if self._probe.findings.restart is Restart.NEVER:
+            raise CapabilityError(
+                f"FMU '{self.fmu_path.name}' cannot begin a second episode: its reset does not "
+                "repeat the first start, and it can be instantiated only once per process"
+            )
+        self._instance.close(self._handles)
+        self._handles, self._free_handles = [], []
+        self._started = False
+        self._elsewhere, self._asked = False, list(self.scenario.plant.initial_state)
+        self._instantiate()
+        return self._instance
+
+    def _check_initial_state(self) -> None:
+        """Refuse an FMU that starts elsewhere than it was asked to."""
+        names = self.scenario.plant.states
+        for name, asked, value in zip(names, self._asked, self._states, strict=True):
+            if not as_asked(asked, value):
+                raise PlantError(
+                    f"FMU '{self.fmu_path.name}' was to start at {name} = {asked:g} and starts at "
+                    f"{value:g}: plant.mapping.initial_state names parameters that do not set it"
+                )
 
     def step(self, a: Sequence[float] | Array) -> Step:
         """Hold the action a (m,) for one sampling time; raises PlantError, then needs a reset."""
@@ -360,9 +222,9 @@ class FmuPlant:
         self._inputs[:] = values
         penalty, k = self._penalty_now, self._k
         self._k = _NOT_STARTED
-        if k in self._changes:
+        if self._changes and k in self._changes:
             self._changes[k]()
-        self._advance(k * self._h)
+        self._advance(self._start_time + k * self._h)
         states, cost = self._states[:], self._outputs[0]
         if not isfinite(cost + sum(states)):
             self._refuse_output(k)
@@ -371,13 +233,13 @@ class FmuPlant:
         return Step(self._copy_states(), cost, penalty, self._copy_disturbances())
 
     def _advance_in_steps(self, time: float) -> None:
-        """Step through a sample; the outputs are those of its begin."""
+        """Step through a sample; the outputs are those of its first step."""
         fmi = self._instance
         fmi.advance(time)
-        begin = self._outputs[:]
+        outputs = self._outputs[:]
         for i in range(1, self._steps):
             fmi.advance(time + i * self._h / self._steps)
-        self._outputs[:] = begin
+        self._outputs[:] = outputs
 
     def drive(self, loop: CompiledLoop, table: Array) -> Array:
         """Take the next samples in a compiled loop, a row of `table` each; return the state (n,).
@@ -403,9 +265,14 @@ class FmuPlant:
 
     def snapshot(self) -> Snapshot:
         """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""
-        fmi, handle = self._running(), self._handle()
+        fmi = self._running()
+        if not self._saves:
+            fmi.require_state()
+            self._require_proof(self._probe.snapshots, "save and restore")
+            self._saves = True
+        handle = self._handle(fmi)
         fmi.save(handle)
-        return Snapshot(self, handle, self._k)
+        return Snapshot(self, fmi, handle, self._k)
 
     def restore(self, snapshot: Snapshot) -> Array:
         """Go back to a snapshot; return its state (n,). Raises PlantError on another plant's."""
@@ -416,7 +283,10 @@ class FmuPlant:
 
     def serialise(self, snapshot: Snapshot) -> bytes:
         """A snapshot as bytes, for any process; raises PlantError on another plant's."""
-        state = self._require_own(snapshot).serialise(snapshot.handle)
+        fmi = self._require_own(snapshot)
+        fmi.require_serialised_state()
+        self._require_proof(self._probe.serialises, "serialise")
+        state = fmi.serialise(snapshot.handle)
         return _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256)) + state
 
     def deserialise(self, data: bytes) -> Snapshot:
@@ -427,27 +297,43 @@ class FmuPlant:
         k, digest = _HEADER.unpack_from(data)
         if digest.hex() != self.fmu_sha256:
             raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
+        fmi.require_serialised_state()
+        self._require_proof(self._probe.serialises, "serialise")
         if not self._started:
             self.reset(0)
-        handle = self._handle()
+        handle = self._handle(fmi)
         fmi.deserialise(data[_HEADER.size :], handle)
-        return Snapshot(self, handle, k)
+        return Snapshot(self, fmi, handle, k)
+
+    def _require_proof(self, fault: str, ability: str) -> None:
+        if fault:
+            raise CapabilityError(
+                f"FMU '{self.fmu_path.name}' declares that it can {ability} its state, but {fault}"
+            )
 
     def _require_own(self, snapshot: Snapshot) -> Instance:
         if snapshot.plant is not self:
             raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
+        if snapshot.instance is not self._instance:
+            raise PlantError(
+                "this snapshot was taken in an earlier episode, and this FMU does not reset: each "
+                "episode is a new instance; serialise a snapshot to carry it"
+            )
         return self._instance
 
-    def _handle(self) -> ctypes.c_void_p:
+    def _handle(self, fmi: Instance) -> ctypes.c_void_p:
         """Memory of a dropped snapshot, or a null handle, which the FMU allocates."""
+        fmi.no_return.value = False
         if not self._free_handles:
             self._handles.append(handle := ctypes.c_void_p())
             return handle
         return self._free_handles.pop()
 
-    def recycle(self, handle: ctypes.c_void_p) -> None:
+    def recycle(self, instance: Instance, handle: ctypes.c_void_p) -> None:
         """Keep a dropped snapshot's memory for the next one; each snapshot calls this."""
-        self._free_handles.append(handle)
+        if instance is self._fmi:
+            self._free_handles.append(handle)
+            instance.no_return.value = len(self._free_handles) == len(self._handles)
 
     def close(self) -> None:
         """Free the FMU instance and every snapshot; a closed plant refuses all calls."""
@@ -495,7 +381,8 @@ class FmuPlant:
             raise PlantError(
                 f"initial_state must be {len(table.states)} finite numbers ({names}), not {state}"
             )
-        for place, value in zip(self._initial, values.tolist(), strict=True):
+        self._asked = values.tolist()
+        for place, value in zip(self._initial, self._asked, strict=True):
             fmi.change_start(place, value)
         self._elsewhere = state is not None
 

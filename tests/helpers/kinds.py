@@ -9,10 +9,11 @@ from tempfile import mkdtemp
 
 import fmpy
 
+from cosim import Scenario
 from fmus import present
 from tests.helpers.tank import write_one_state
 
-SOURCE = Path(__file__).parent / "foreign" / "kinds.c"
+SOURCES = Path(__file__).parent / "foreign"
 REALS = """
 u     0  input      -        0
 x     1  output     -        -
@@ -23,14 +24,14 @@ range 4  parameter  fixed    0
 
 
 @cache
-def library(version):
-    """The compiled source with a refusing stub for each function that it lacks, as bytes."""
+def library(version, source="kinds"):
+    """A compiled source with a refusing stub for each function that it lacks, as bytes."""
     folder = Path(mkdtemp())
     headers = Path(fmpy.__file__).parent / "c-code"
     functions = re.findall(
         rf"FMI{version}_Export \w+TYPE\s+(\w+);", (headers / f"fmi{version}Functions.h").read_text()
     )
-    text = SOURCE.read_text()
+    text = (SOURCES / f"{source}.c").read_text()
     own = text.split("#if VERSION == 2")[1].split("#else")[version - 2]
     stubs = [f"int {name}(void) {{ return 3; }}" for name in functions if f"{name}(" not in own]
     (folder / "kinds.c").write_text(text + "\n".join(stubs) + "\n")
@@ -87,6 +88,7 @@ def build_kind(
     more="",
     separator="/",
     data=None,
+    source="kinds",
 ):
     """Write an FMU whose description differs from the plain kind's as told; return its path."""
     token = "guid" if version == 2 else "instantiationToken"
@@ -99,7 +101,7 @@ def build_kind(
     entry = separator.join(["binaries", present().folder(f"{version}.0"), "kinds.so"])
     with zipfile.ZipFile(target, "w") as archive:
         archive.writestr("modelDescription.xml", text)
-        archive.writestr(entry, library(version) if data is None else data)
+        archive.writestr(entry, library(version, source) if data is None else data)
         archive.writestr(separator.join(["resources", "readme.txt"]), b"nothing")
     return target
 
@@ -109,3 +111,32 @@ def scenario_for(folder, fmu, *, sampling_time=0.5, fault=0, parameters=""):
     plant = f"parameters = {{ fault = {fault}{parameters} }}\n"
     plant += 'mapping = { initial_state = ["x_start"], seed = ["seed"] }'
     return write_one_state(folder / "kind.toml", fmu, plant, sampling_time)
+
+
+HABIT_REALS = """
+u       0  input      -        0
+x       1  output     -        -
+cost    2  output     -        -
+d       3  output     -        -
+x_start 4  parameter  fixed    1
+key     6  parameter  tunable  0
+enable  7  input      -        0
+"""
+
+
+def build_habits(folder, version=2, *, experiment="", once=False):
+    """Write the FMU of `foreign/habits.c`; return its path."""
+    face = 'CoSimulation modelIdentifier="kinds" canHandleVariableCommunicationStepSize="true" '
+    face += f'canGetAndSetFMU{"state" if version == 2 else "State"}="true"'
+    face += ' canBeInstantiatedOnlyOncePerProcess="true"' if once else ""
+    return build_kind(
+        folder, version, face=face, experiment=experiment, reals=HABIT_REALS, source="habits"
+    )
+
+
+def habit_scenario(folder, fmu, habits=0, **plant):
+    """A scenario for that FMU with a sum of habits, and further fields of its table [plant]."""
+    lines = f'disturbances = ["d"]\nparameters = {{ fault = {habits} }}\n'
+    lines += 'mapping = { initial_state = ["x_start"] }'
+    path = write_one_state(folder / "habits.toml", fmu, lines)
+    return Scenario.load(path).replace({"plant": plant})

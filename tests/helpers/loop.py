@@ -71,3 +71,20 @@ class Hold:
 
 def hold(scenario):
     return Hold(scenario.reference_action)
+
+
+class Playback:
+    """Applies given actions (K, m), from the first on after each reset."""
+
+    def __init__(self, actions):
+        self._actions = np.asarray(actions, dtype=float)
+        self._k = -1
+
+    def reset(self):
+        self._k = -1
+
+    def prepare(self):
+        self._k += 1
+
+    def feedback(self, s, a=None):
+        return Decision(self._actions[self._k])

@@ -70,8 +70,13 @@ typedef struct {
     const unsigned *inputs, *outputs, *states;
     size_t n_inputs, n_outputs, n_states;
     double *input, *output, *state;
-    double step_size;
+    double start_time, step_size;
+    int order;     /* when the outputs are read, of the enumeration below */
+    int no_return; /* whether no snapshot can take the FMU back to before its present time */
 } Plant;
+
+/* `cosim.plant.fmi.Order` says which FMU takes which. */
+enum { SET_GET_STEP, GET_SET_STEP, SET_STEP_GET };
 
 enum { OK, FAILED_SET, FAILED_GET, FAILED_STEP, ENDED, NOT_FINITE };
 
@@ -85,27 +90,38 @@ static int plant_get(const Plant *plant, const unsigned references[], size_t cou
                : ((Get3)plant->get)(plant->component, references, count, values, count);
 }
 
-/* Write the inputs, read the outputs, step, read the states; `status` gets FMI's own. */
+/* Write the inputs, step, read the states, and the outputs before or after the step as `order` says;
+ * `status` gets FMI's own. */
 static int plant_step(const Plant *plant, double time, int *status) {
     typedef int (*Set2)(void *, const unsigned *, size_t, const double *);
     typedef int (*Set3)(void *, const unsigned *, size_t, const double *, size_t);
     typedef int (*Step2)(void *, double, double, int);
     typedef int (*Step3)(void *, double, double, _Bool, _Bool *, _Bool *, _Bool *, double *);
     _Bool event = 0, terminate = 0, early = 0;
-    double last = 0.0;
+    double last = INFINITY; /* where the FMU does not say how far it came */
+    if (plant->order == GET_SET_STEP) {
+        *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
+        if (refused(*status)) return FAILED_GET;
+    }
     *status = plant->version == 2
                   ? ((Set2)plant->set)(plant->component, plant->inputs, plant->n_inputs, plant->input)
                   : ((Set3)plant->set)(plant->component, plant->inputs, plant->n_inputs,
                                        plant->input, plant->n_inputs);
     if (refused(*status)) return FAILED_SET;
-    *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
-    if (refused(*status)) return FAILED_GET;
+    if (plant->order == SET_GET_STEP) {
+        *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
+        if (refused(*status)) return FAILED_GET;
+    }
     *status = plant->version == 2
-                  ? ((Step2)plant->step)(plant->component, time, plant->step_size, 0)
-                  : ((Step3)plant->step)(plant->component, time, plant->step_size, 0, &event,
-                                         &terminate, &early, &last);
+                  ? ((Step2)plant->step)(plant->component, time, plant->step_size, plant->no_return)
+                  : ((Step3)plant->step)(plant->component, time, plant->step_size,
+                                         plant->no_return, &event, &terminate, &early, &last);
     if (refused(*status)) return FAILED_STEP;
-    if (terminate || early) return ENDED;
+    if (terminate || early || last < time + 0.5 * plant->step_size) return ENDED;
+    if (plant->order == SET_STEP_GET) {
+        *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
+        if (refused(*status)) return FAILED_GET;
+    }
     *status = plant_get(plant, plant->states, plant->n_states, plant->state);
     if (refused(*status)) return FAILED_GET;
     return all_finite(plant->state, (int)plant->n_states) && isfinite(plant->output[0]) ? OK
@@ -172,7 +188,8 @@ long long engine_run(Loop *loop, const Plant *plant, long long first, long long 
         table += N_W;
         memcpy(plant->input, loop->applied, N_U * sizeof(double));
         const double before = seconds();
-        fault[0] = plant_step(plant, (double)sample * plant->step_size, &fault[1]);
+        const double time = plant->start_time + (double)sample * plant->step_size;
+        fault[0] = plant_step(plant, time, &fault[1]);
         const double after = seconds();
         if (fault[0] != OK) return sample;
         memcpy(table, plant->output, plant->n_outputs * sizeof(double));

@@ -7,6 +7,8 @@ from controllers import Parameters, Problem, QpError, RtiNmpc, ThetaBlocks, func
 from controllers.factories import tuned
 from controllers.rti import nmpc
 from cosim import FmuPlant, Scenario, simulate
+from cosim.plant.fmi import Order, Reading
+from cosim.plant.probe import Probe
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.sampling import evaporator_problem, random_parameters
 
@@ -164,6 +166,21 @@ def test_its_loop_meets_the_plants_changes(monkeypatch):
     with FmuPlant(loaded) as plant:
         for _ in range(2):
             runs.append(simulate(plant, controller, 60, 0).to_csv())
+            monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("fmu", ["evaporator", "evaporator_fmi3"])
+@pytest.mark.parametrize("order", Order)
+def test_its_loop_reads_the_outputs_in_each_order(monkeypatch, order, fmu):
+    monkeypatch.setattr(Probe, "reading", Reading(order))
+    loaded = Scenario.load("paper").replace({"plant": {"start_time": 3600.0}})
+    controller, runs = tuned(loaded), []
+    controller.compile()
+    with FmuPlant(loaded, fmu) as plant:
+        for _ in range(2):
+            assert plant.drivable
+            runs.append(simulate(plant, controller, 40, 0).to_csv())
             monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
     assert runs[0] == runs[1]
 

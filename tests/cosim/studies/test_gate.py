@@ -13,7 +13,7 @@ from controllers import evaporator
 from controllers.problem import Problem
 from controllers.rti.nmpc import RtiSolution
 from cosim.cli.main import app
-from cosim.plant.fmu_plant import Wiring
+from cosim.plant.wiring import Wiring
 from learning.baselines import BackOffSearch
 
 pytestmark = pytest.mark.campaign

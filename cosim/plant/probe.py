@@ -1,0 +1,838 @@
+"""What an FMU can do as a plant, found out by trying it on instances that are thrown away.
+
+A model description may be silent or wrong about all of it: whether outputs follow the inputs,
+whether a reset resets, whether a saved state is the whole state. A plant relies on what was seen.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from itertools import product
+from math import ceil, floor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosim.errors import PlantError
+from cosim.plant.fmi import (
+    Experiment,
+    Instance,
+    Order,
+    Place,
+    Reading,
+    UnpackedFmu,
+    unpack,
+)
+from cosim.plant.wiring import REALS, Wiring, experiment, has_start, interface
+from cosim.scenario import Scenario
+
+
+class Kind(Enum):
+    """Where the numbers of an output belong, and what shows it."""
+
+    FOLLOWS = "follows the actions at once"
+    """Get after Set gives g(x_k, u_k): read before the step."""
+    INSTANT = "is of state, time or noise alone"
+    """It changes with the step and not with the actions: read before the step."""
+    SAMPLE = "is computed by doStep from the sample's begin"
+    """After the step it is ℓ(x_k, u_k, d_k), however long the step was: read after the step."""
+    END = "is computed by doStep and belongs to the end of the step"
+    """After the step it is g(x_{k+1}, u_k); what it is at the sample's begin cannot be had."""
+    CONSTANT = "did not change"
+    OPEN = "cannot be told"
+
+
+BEFORE = (Kind.FOLLOWS, Kind.INSTANT)
+AFTER = (Kind.SAMPLE, Kind.END)
+
+
+class Restart(Enum):
+    """How a second episode begins."""
+
+    RESET = "a reset repeats the first start bit for bit"
+    FRESH = "a new instance"
+    NEVER = "none"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a report: what was asked, what was seen, and what follows for the plant."""
+
+    subject: str
+    found: str
+    consequence: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was found out about an FMU as a plant.
+
+    `rows` tell it; the other fields are the same for programs. `outputs` is the value of
+    `plant.outputs` that fits, None where the outputs differ; `kinds` says where each output
+    belongs, by name, stage cost first. `still` are the actions that move no state, and whether
+    they move an output; `undriven` the inputs that nobody sets, with their start values.
+    """
+
+    fmu: Path
+    sha256: str
+    rows: tuple[Row, ...]
+    outputs: str | None
+    kinds: dict[str, Kind]
+    restart: Restart
+    snapshots: bool
+    serialises: bool
+    experiment: Experiment
+    still: dict[str, bool]
+    undriven: dict[str, str]
+    starts_anywhere: bool
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An FMU with what a probe needs to drive it.
+
+    `exchanged` are the places of inputs, outputs and states, `names` their names; `starts` the
+    start values, `start_names` the names of the first of them; `step` the communication step in s;
+    `low` and `high` two values of each input.
+    """
+
+    fmu: UnpackedFmu
+    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]
+    exchanged: tuple[tuple[Place, ...], tuple[Place, ...], tuple[Place, ...]]
+    starts: tuple[tuple[Place, float], ...]
+    start_names: tuple[str, ...]
+    step: float
+    experiment: Experiment
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What a finding holds for."""
+        given = self.exchanged, self.starts, self.step, self.experiment, self.low, self.high
+        return (self.fmu.sha256, *given)
+
+
+def subject_of(scenario: Scenario, fmu: UnpackedFmu, wiring: Wiring) -> Subject:
+    """The FMU as a scenario wires it; its actions vary about the reference within the bounds."""
+    plant = scenario.plant
+    step = plant.communication_step or scenario.sampling_time
+    steps = round(scenario.sampling_time / step)
+    pairs = []
+    for name, reference, bounds in zip(
+        plant.actions,
+        scenario.reference_action.tolist(),
+        zip(scenario.action_lower.tolist(), scenario.action_upper.tolist(), strict=True),
+        strict=True,
+    ):
+        pairs.append(_two_values(fmu.variable(name), reference, *bounds))
+    return Subject(
+        fmu=fmu,
+        names=(plant.actions, (plant.stage_cost, *plant.disturbances), plant.states),
+        exchanged=(tuple(wiring.inputs), tuple(wiring.outputs), tuple(wiring.states)),
+        starts=tuple(wiring.starts),
+        start_names=tuple(wiring.start_names),
+        step=scenario.sampling_time / steps,
+        experiment=wiring.experiment,
+        low=tuple(low for low, _ in pairs),
+        high=tuple(high for _, high in pairs),
+    )
+
+
+def _two_values(variable: Any, value: float, lower: float, upper: float) -> tuple[float, float]:
+    """A value within bounds and the variable's own range, and another one."""
+    lower = max(lower, -np.inf if variable.min is None else float(variable.min))
+    upper = min(upper, np.inf if variable.max is None else float(variable.max))
+    if variable.type not in REALS:
+        lower, upper, value = ceil(lower), floor(upper), round(value)
+    value = min(max(value, lower), upper)
+    if variable.type not in REALS:
+        return value, float(upper if value != upper else lower)
+    distance = 0.25 * (upper - lower)
+    return value, value + distance if value + distance <= upper else value - distance
+
+
+def bare_subject(
+    fmu: UnpackedFmu,
+    actions: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    states: Sequence[str] = (),
+    step: float | None = None,
+) -> Subject:
+    """The FMU without a scenario; what is not named are its real inputs, outputs and states."""
+    known = fmu.variables
+    scalars = [v for v in fmu.description.modelVariables if v.type in REALS and not v.shape]
+    rates = [v.derivative.name for v in scalars if getattr(v, "derivative", None)]
+    all_outputs = [v.name for v in scalars if v.causality == "output"]
+    states = tuple(states or dict.fromkeys(rates) or all_outputs)
+    outputs = tuple(outputs or [name for name in all_outputs if name not in states])
+    actions = tuple(actions or [v.name for v in scalars if v.causality == "input"])
+    default = fmu.description.defaultExperiment
+    stated = step or float(getattr(default, "stepSize", None) or 0.0)
+    internal = float(fmu.description.coSimulation.fixedInternalStepSize or 0.0)
+    pairs = []
+    for name in actions:
+        value = float(str(known[name].start or 0).split()[0])
+        reach = max(abs(value), 1.0)
+        pairs.append(_two_values(known[name], value, value - reach, value + reach))
+    return Subject(
+        fmu=fmu,
+        names=(actions, outputs, states),
+        exchanged=(_places(fmu, actions), _places(fmu, outputs), _places(fmu, states)),
+        starts=(),
+        start_names=(),
+        step=stated or internal or 1.0,
+        experiment=experiment(fmu),
+        low=tuple(low for low, _ in pairs),
+        high=tuple(high for _, high in pairs),
+    )
+
+
+def _places(fmu: UnpackedFmu, names: Sequence[str]) -> tuple[Place, ...]:
+    found = []
+    for name in names:
+        variable = fmu.variable(name)
+        if variable is None:
+            raise PlantError(f"FMU '{fmu.path.name}' has no variable '{name}'")
+        found.append(Place(int(variable.valueReference), str(variable.type)))
+    return tuple(found)
+
+
+class Sample(NamedTuple):
+    """Numbers of one step: outputs after the inputs were set (if one looked), states and outputs
+    after the step.
+    """
+
+    looked: tuple[float, ...]
+    states: tuple[float, ...]
+    outputs: tuple[float, ...]
+
+
+class Run(NamedTuple):
+    """States and outputs after the initialisation, and the steps that followed."""
+
+    states: tuple[float, ...]
+    outputs: tuple[float, ...]
+    samples: tuple[Sample, ...]
+
+
+class _CannotStartAgainError(PlantError):
+    """The one instance that a process may have does not reset."""
+
+
+class _Bench:
+    """Instances to try, one at a time: a reset one where resets are known to work, else new ones.
+
+    An FMU that can be instantiated only once per process has one in all.
+    """
+
+    def __init__(self, subject: Subject, experiment: Experiment) -> None:
+        self._subject, self._experiment = subject, experiment
+        self._instance: Instance | None = None
+        self._is_new = False
+        self.resets = False
+        self.handle = ctypes.c_void_p()
+
+    def start(self, *, by_reset: bool | None = None) -> Instance:
+        """An initialised instance; `by_reset` forces how it is had."""
+        reset = self.resets if by_reset is None else by_reset
+        if self._instance is None or not (self._is_new or reset):
+            self.instantiate()
+        assert self._instance is not None
+        self._instance.initialise(started=not self._is_new)
+        self._is_new = False
+        return self._instance
+
+    def instantiate(self) -> None:
+        """Make a new instance, in place of the one before."""
+        subject = self._subject
+        once = subject.fmu.description.coSimulation.canBeInstantiatedOnlyOncePerProcess
+        if self._instance is not None and once:
+            raise _CannotStartAgainError("it has one instance per process, which does not reset")
+        self.close()
+        self._instance = interface(subject.fmu)(
+            subject.fmu,
+            subject.exchanged,
+            subject.starts,
+            subject.step,
+            Reading(Order.SET_STEP_GET),
+            self._experiment,
+            None,
+        )
+        self._is_new = True
+
+    def close(self) -> None:
+        """Free the instance and what was saved of it."""
+        if self._instance is not None:
+            self._instance.close([self.handle])
+            self._instance, self.handle = None, ctypes.c_void_p()
+
+    def run(
+        self,
+        inputs: Sequence[tuple[float, ...]],
+        *,
+        look: bool = False,
+        sizes: Sequence[float] = (),
+        spacing: float | None = None,
+        by_reset: bool | None = None,
+    ) -> Run:
+        """Start, and step under these inputs, by `sizes` [s] where they are not the step.
+
+        With `look` the outputs are also read after each set, which FMI forbids.
+        """
+        fmi = self.start(by_reset=by_reset)
+        states, outputs = tuple(fmi.states), tuple(fmi.read_outputs())
+        samples = self.go_on(fmi, inputs, look=look, sizes=sizes, spacing=spacing)
+        return Run(states, outputs, samples)
+
+    def go_on(
+        self,
+        fmi: Instance,
+        inputs: Sequence[tuple[float, ...]],
+        *,
+        first: int = 0,
+        look: bool = False,
+        sizes: Sequence[float] = (),
+        spacing: float | None = None,
+    ) -> tuple[Sample, ...]:
+        """Step from sample `first` on; samples lie `spacing` [s] apart, if not a step."""
+        step, samples = spacing or self._subject.step, []
+        lengths = sizes or [step] * len(inputs)
+        for k, (values, size) in enumerate(zip(inputs, lengths, strict=True), first):
+            fmi.write_inputs(values)
+            looked = tuple(fmi.read_outputs()) if look else ()
+            states = tuple(fmi.take_step(self._experiment.start_time + k * step, size))
+            samples.append(Sample(looked, states, tuple(fmi.read_outputs())))
+        return tuple(samples)
+
+
+def _same(one: Run | Sequence[Sample], other: Run | Sequence[Sample]) -> bool:
+    """Whether two runs, or parts of them, have the same numbers; what was looked at is left out."""
+    return np.array_equal(_numbers(one), _numbers(other), equal_nan=True)
+
+
+def _numbers(part: Run | Sequence[Sample]) -> list[float]:
+    if isinstance(part, Run):
+        return [*part.states, *part.outputs, *_numbers(part.samples)]
+    return [number for sample in part for number in (*sample.states, *sample.outputs)]
+
+
+GENTLE = 0.02
+"""Share of the distance by which inputs vary where an FMU failed under the whole of it."""
+SHORT = 2.0**-14
+"""A short step, as a share of a step: what is continuous has hardly moved."""
+HARDLY = 0.05
+"""How far an output may move in a short step, as a share of its move in a step."""
+
+
+def as_asked(asked: float, value: float) -> bool:
+    """Whether an FMU has the number that it was given, within rounding of a float of 32 bits."""
+    return abs(asked - value) <= 1e-6 * max(abs(asked), abs(value))
+
+
+class Point(NamedTuple):
+    """What follows from sample `k` on: the numbers before the step, after it, after half of it, and
+    after short ones under either input.
+    """
+
+    k: int
+    before: Sample
+    after: Sample
+    half: Sample
+    short: tuple[Sample, ...]
+
+    def moves(self) -> bool:
+        """Whether half a step ends in another state than a whole one."""
+        return self.after.states != self.half.states
+
+    def is_continuous(self, i: int) -> bool | None:
+        """Whether output i is hardly moved by a short step, whatever the input.
+
+        An output that the step computes from the input is: it jumps, for one input at least. None
+        where nothing moves: neither the output in a step, nor anything in a short one.
+        """
+        before, after = self.before.outputs[i], self.after.outputs[i]
+        made = any(
+            sample.states != self.before.states or sample.outputs[i] != before
+            for sample in self.short
+        )
+        if not made:
+            return None if after == before else False
+        reach = HARDLY * abs(after - before)
+        return all(abs(sample.outputs[i] - before) <= reach for sample in self.short)
+
+
+def _kind_of(i: int, points: Sequence[Point], acts: bool, starts_alike: bool) -> Kind:
+    """Where output i belongs, of one that changes and does not follow a set.
+
+    `acts` says that it depends on the action of the same step, `starts_alike` that its value after
+    the initialisation repeats.
+    """
+    if any(point.after.outputs[i] != point.half.outputs[i] for point in points):
+        shown = {point.is_continuous(i) for point in points} - {None}
+        return Kind.INSTANT if shown == {True} and starts_alike else Kind.END
+    for point in points:
+        changed = point.after.outputs[i] != point.before.outputs[i]
+        if point.moves() and (changed or (acts and point.k == 0)):
+            return Kind.SAMPLE
+    return Kind.OPEN
+
+
+class Findings(NamedTuple):
+    """What `Probe` finds out before a plant runs.
+
+    `kinds` (p,) say where each output belongs; `harmless` whether a get after a set leaves what
+    follows as it is, None where that is not known. `misset` are the start values that the FMU has
+    not as asked: name, value asked for, value had. `keeps_to_step` is false where a step goes
+    equally far however long it is told to be. `failure` is what the FMU said if it failed
+    meanwhile, else empty.
+    """
+
+    experiment: Experiment
+    restart: Restart
+    kinds: tuple[Kind, ...]
+    harmless: bool | None
+    misset: tuple[tuple[str, float, float], ...]
+    keeps_to_step: bool
+    failure: str
+
+
+class Probe:
+    """What is known of a subject; each property tries it once and keeps what it finds.
+
+    Raises PlantError where the FMU cannot be instantiated at all. An FMU that fails while it is
+    tried leaves a question open.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        self._open = (Kind.OPEN,) * len(subject.names[1])
+        self._vary_inputs(1.0)
+
+    def _vary_inputs(self, share: float) -> None:
+        """Choose the inputs of the runs; real ones vary by a share of their distance."""
+        low, high = self.subject.low, list(self.subject.high)
+        for i, place in enumerate(self.subject.exchanged[0]):
+            if place.type in REALS:
+                high[i] = low[i] + share * (high[i] - low[i])
+        self._low, self._high = low, tuple(high)
+        self._inputs = (self._high, low, self._high, low, low, self._high)
+        self._other_inputs = (low, low, low, low, low, low)
+        self._late_inputs = (self._high, low, low)
+
+    @cached_property
+    def findings(self) -> Findings:
+        """When outputs are read, how an episode begins, what the FMU is told."""
+        attempts = [self.subject.experiment]
+        default = getattr(self.subject.fmu.description.defaultExperiment, "stopTime", None)
+        if attempts[0].stop_time is None and default is not None:
+            attempts.append(attempts[0]._replace(stop_time=float(default)))
+        failures = []
+        # An FMU may not bear what a controller would not do; nearer to the reference it may.
+        for share, attempt in product((1.0, GENTLE), attempts):
+            self._vary_inputs(share)
+            bench = _Bench(self.subject, attempt)
+            try:
+                bench.instantiate()
+                try:
+                    first = bench.run(self._inputs)
+                except PlantError as error:
+                    failures.append(str(error))
+                    continue
+                return self._examine(bench, first, attempt)
+            finally:
+                bench.close()
+        # It fails at once: the plant will say so when it is used.
+        return Findings(attempts[0], Restart.FRESH, self._open, None, (), True, failures[0])
+
+    def _examine(self, bench: _Bench, first: Run, experiment: Experiment) -> Findings:
+        """What the runs after a first one show; the first failure ends it."""
+        seen = Findings(experiment, Restart.FRESH, self._open, None, (), True, "")
+        try:
+            bench.resets = _same(bench.run(self._inputs, by_reset=True), first)
+        except PlantError as error:
+            seen = seen._replace(failure=str(error))
+        try:
+            if bench.resets:
+                seen = seen._replace(restart=Restart.RESET)
+                starts_alike = True
+            else:
+                second = bench.run(self._inputs, by_reset=False)
+                starts_alike = second.outputs == first.outputs
+                if not _same(second.samples, first.samples):
+                    line = "two new instances under the same actions give different numbers"
+                    return seen._replace(failure=seen.failure or line)
+            looked = bench.run(self._inputs, look=True).samples
+            seen = seen._replace(harmless=_same(looked, first.samples))
+            kinds = self._kinds(bench, first, looked if seen.harmless else (), starts_alike)
+            seen = seen._replace(kinds=kinds, misset=self._misset(bench))
+            return seen._replace(keeps_to_step=self._keeps_to_step(bench, first))
+        except _CannotStartAgainError as error:
+            return seen._replace(restart=Restart.NEVER, failure=str(error))
+        except PlantError as error:
+            return seen._replace(failure=str(error))
+
+    def _keeps_to_step(self, bench: _Bench, first: Run) -> bool:
+        """Whether half a step ends elsewhere than a whole one, or two halves where it does.
+
+        A sampled plant, which moves at the begin of a sample and rests till the next, does the
+        latter; one that goes by a step of its own, whatever it is told, neither.
+        """
+        half = self.subject.step / 2
+        try:
+            halves = bench.run(self._inputs[:1] * 2, sizes=[half, half], spacing=half).samples
+        except PlantError:
+            bench.instantiate()
+            return True
+        whole = first.samples[0].states
+        return halves[0].states != whole or halves[1].states == whole
+
+    def _misset(self, bench: _Bench) -> tuple[tuple[str, float, float], ...]:
+        asked = [value for _, value in self.subject.starts]
+        present = bench.start().read_starts()
+        rows = zip(self.subject.start_names, asked, present, strict=False)
+        return tuple(row for row in rows if not as_asked(*row[1:]))
+
+    def _kinds(
+        self, bench: _Bench, first: Run, looked: Sequence[Sample], starts_alike: bool
+    ) -> tuple[Kind, ...]:
+        """Where each output belongs, by runs that differ in one thing.
+
+        `looked` are the samples of `first` with a look after each set, if that is harmless.
+        """
+        other = bench.run(self._other_inputs[:1], look=bool(looked))
+        follows = [False] * len(self.subject.names[1])
+        if looked:
+            late = bench.run(self._late_inputs, look=True)
+            for i in range(len(follows)):
+                at_once = looked[0].looked[i] != other.samples[0].looked[i]
+                follows[i] = at_once and looked[2].looked[i] != late.samples[2].looked[i]
+        points = [self._point(bench, first, 0)]
+        if self.subject.fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
+            points.append(self._point(bench, first, 2))
+        kinds = []
+        for i, place in enumerate(self.subject.exchanged[1]):
+            acts = first.samples[0].outputs[i] != other.samples[0].outputs[i]
+            changes = {first.outputs[i]} != {sample.outputs[i] for sample in first.samples}
+            if place in self.subject.exchanged[2]:
+                kinds.append(Kind.INSTANT)
+            elif follows[i]:
+                kinds.append(Kind.FOLLOWS)
+            elif not (acts or changes):
+                kinds.append(Kind.CONSTANT)
+            else:
+                made = [point for point in points if point is not None]
+                kinds.append(_kind_of(i, made, acts, starts_alike))
+        return tuple(kinds)
+
+    def _point(self, bench: _Bench, first: Run, k: int) -> Point | None:
+        """Steps of other lengths from sample k on; None where the FMU refuses them."""
+        step = self.subject.step
+        before = first.samples[k - 1] if k else Sample((), first.states, first.outputs)
+        try:
+            other, *short = (
+                bench.run((*self._inputs[:k], values), sizes=[step] * k + [size]).samples[k]
+                for values, size in (
+                    (self._inputs[k], step / 2),
+                    (self._low, step * SHORT),
+                    (self._high, step * SHORT),
+                )
+            )
+        except PlantError:
+            bench.instantiate()
+            return None
+        return Point(k, before, first.samples[k], other, tuple(short))
+
+    @cached_property
+    def reading(self) -> Reading:
+        """The order of a step's calls that gives each output where it belongs."""
+        kinds = self.findings.kinds
+        if Kind.FOLLOWS in kinds:
+            order = Order.SET_GET_STEP
+        elif Kind.INSTANT in kinds:
+            order = Order.GET_SET_STEP
+        else:
+            return Reading(Order.SET_STEP_GET)
+        late = tuple(i for i, kind in enumerate(kinds) if kind in (*AFTER, Kind.OPEN))
+        return Reading(order, late)
+
+    @property
+    def outputs(self) -> str | None:
+        """The value of `plant.outputs` that fits, None where the outputs differ."""
+        reading = self.reading
+        if reading.late:
+            return None
+        return "after-step" if reading.order is Order.SET_STEP_GET else "before-step"
+
+    def stated(self, outputs: str) -> Reading:
+        """The reading for a value of `plant.outputs`; raises PlantError where it was seen wrong."""
+        wrong = AFTER if outputs == "before-step" else BEFORE
+        kinds = self.findings.kinds
+        seen = next(
+            (
+                f"output '{name}' {kind.value}"
+                for name, kind in zip(self.subject.names[1], kinds, strict=True)
+                if kind in wrong
+            ),
+            "",
+        )
+        if not seen and outputs == "before-step" and self.findings.harmless is False:
+            seen = "a get after a set changes what follows"
+        if seen:
+            cure = f'set it to "{self.outputs}"' if self.outputs else "leave it out"
+            raise PlantError(
+                f'plant.outputs = "{outputs}" does not fit FMU '
+                f"'{self.subject.fmu.path.name}': {seen}; {cure}"
+            )
+        if outputs == "after-step":
+            return Reading(Order.SET_STEP_GET)
+        instant = Kind.INSTANT in kinds and Kind.FOLLOWS not in kinds
+        return Reading(Order.GET_SET_STEP if instant else Order.SET_GET_STEP)
+
+    @property
+    def misfit(self) -> str:
+        """Why the FMU cannot be the plant as asked; empty if it can."""
+        findings, name = self.findings, f"FMU '{self.subject.fmu.path.name}'"
+        for start, asked, value in findings.misset:
+            return (
+                f"{name} was given {start} = {asked:g} and has {value:g} after its initialisation"
+            )
+        default = self.subject.fmu.description.defaultExperiment
+        step, own = self.subject.step, float(getattr(default, "stepSize", None) or 0.0)
+        if not findings.keeps_to_step and own and abs(step - own) > 1e-9 * own:
+            return (
+                f"{name} goes equally far however long a step is told to be, and its own step is "
+                f"{own:g} s by its default experiment, not {step:g} s: set sampling_time or "
+                "plant.communication_step to it"
+            )
+        return ""
+
+    @property
+    def cost_of_sample(self) -> bool:
+        """Whether the stage cost is that of the sample's begin, ℓ(x_k, u_k, d_k), or may be."""
+        return self.findings.kinds[0] is not Kind.END
+
+    @cached_property
+    def snapshots(self) -> str:
+        """Why a saved state cannot be relied on; empty if it can."""
+        return self._tried(self._try_snapshot)
+
+    @cached_property
+    def serialises(self) -> str:
+        """Why a serialised state cannot be relied on; empty if it can."""
+        return self.snapshots or self._tried(self._try_serialised)
+
+    def _tried(self, attempt: Callable[[_Bench], str]) -> str:
+        bench = _Bench(self.subject, self.findings.experiment)
+        try:
+            bench.instantiate()
+            return attempt(bench)
+        except PlantError as error:
+            return str(error)
+        finally:
+            bench.close()
+
+    def _saved(self, bench: _Bench) -> tuple[Instance, tuple[float, ...], tuple[Sample, ...]]:
+        """Save after the first sample; the states then, and what followed."""
+        fmi = bench.start()
+        fmi.require_state()
+        fmi.no_return.value = False
+        bench.go_on(fmi, self._inputs[:1])
+        states = tuple(fmi.states)
+        fmi.save(bench.handle)
+        return fmi, states, bench.go_on(fmi, self._inputs[1:], first=1)
+
+    def _try_snapshot(self, bench: _Bench) -> str:
+        without = bench.run(self._inputs)
+        fmi, states, samples = self._saved(bench)
+        if not _same(samples, without.samples[1:]):
+            return "while a state is saved the same steps give other numbers"
+        fmi.load(bench.handle)
+        if tuple(fmi.states) != states:
+            return "a state that was saved and set again is another one"
+        if not _same(bench.go_on(fmi, self._inputs[1:], first=1), samples):
+            return "after a state was saved and set again the same steps give other numbers"
+        return ""
+
+    def _try_serialised(self, bench: _Bench) -> str:
+        fmi, states, samples = self._saved(bench)
+        data = fmi.serialise(bench.handle)
+        fmi.deserialise(data, bench.handle)
+        fmi.load(bench.handle)
+        same = tuple(fmi.states) == states
+        if not same or not _same(bench.go_on(fmi, self._inputs[1:], first=1), samples):
+            return "after a state was serialised and set again the same steps give other numbers"
+        return ""
+
+    @cached_property
+    def still(self) -> dict[str, bool]:
+        """The actions that move no state by themselves, and whether they move an output."""
+        bench = _Bench(self.subject, self.findings.experiment)
+        try:
+            bench.instantiate()
+            rest = bench.run(self._other_inputs).samples
+            names = {}
+            for i, name in enumerate(self.subject.names[0]):
+                moved = list(self._low)
+                moved[i] = self._high[i]
+                samples = bench.run([tuple(moved)] * len(rest)).samples
+                if [sample.states for sample in samples] == [sample.states for sample in rest]:
+                    names[name] = not _same(samples, rest)
+            return names
+        except PlantError:
+            return {}
+        finally:
+            bench.close()
+
+
+_probes: dict[tuple[Any, ...], Probe] = {}
+
+
+def probe_of(subject: Subject) -> Probe:
+    """The one probe of a subject in this process."""
+    key = subject.key
+    if key not in _probes:
+        _probes[key] = Probe(subject)
+    return _probes[key]
+
+
+def probe(
+    plant: Scenario | str | Path,
+    *,
+    actions: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    states: Sequence[str] = (),
+    step: float | None = None,
+) -> Report:
+    """Find out whether an FMU can be a plant, and how.
+
+    Args:
+        plant: A scenario, or an FMU: the path of one or the name of a shipped one.
+        actions: Of an FMU, the inputs to act on; without them its real inputs.
+        outputs: Of an FMU, the stage cost and disturbances; without them its real outputs.
+        states: Of an FMU, its states; without them those with a derivative, else the outputs.
+        step: Of an FMU, the communication step in s; without it that of its default experiment.
+
+    Returns:
+        What was tried, what was seen, and what follows.
+
+    Raises:
+        PlantError: The FMU cannot be loaded or instantiated, or lacks a variable.
+    """
+    if isinstance(plant, Scenario):
+        fmu = unpack(plant.plant.fmu)
+        subject = subject_of(plant, fmu, Wiring(plant, fmu))
+        starts_anywhere = bool(plant.plant.mapping.initial_state)
+    else:
+        fmu = unpack(plant)
+        subject = bare_subject(fmu, actions, outputs, states, step)
+        starts_anywhere = all(
+            has_start(fmu.variable(name)) or f"{name}_start" in fmu.variables
+            for name in subject.names[2]
+        )
+    return _report(probe_of(subject), starts_anywhere)
+
+
+def _report(seen: Probe, starts_anywhere: bool) -> Report:
+    subject, findings = seen.subject, seen.findings
+    fmu, kinds = subject.fmu, dict(zip(subject.names[1], findings.kinds, strict=True))
+    given = {place[:3] for place, _ in subject.starts}
+    undriven = {
+        v.name: str(v.start or "")
+        for v in fmu.description.modelVariables
+        if v.causality == "input"
+        and v.name not in subject.names[0]
+        and (int(v.valueReference), str(v.type), 0) not in given
+    }
+    rows = [
+        _outputs_row(seen, kinds),
+        _restart_row(findings),
+        _ability_row("snapshot", seen.snapshots, "plants can be saved and restored"),
+        _ability_row("serialise", seen.serialises, "checkpoints of a training carry the plant"),
+        _experiment_row(findings.experiment, subject.experiment),
+        _still_row(seen.still),
+        Row(
+            "inputs that nobody drives",
+            ", ".join(f"{name} = {start or '?'}" for name, start in undriven.items()) or "none",
+            "they stay at their start values; plant.parameters may set them" if undriven else "",
+        ),
+        Row(
+            "start state",
+            "can be set" if starts_anywhere else "cannot be set",
+            "" if starts_anywhere else "episodes start where the FMU does",
+        ),
+    ]
+    if not findings.keeps_to_step:
+        rows.append(
+            Row(
+                "step",
+                "goes equally far however long a step is told to be",
+                "sampling time or plant.communication_step must be the FMU's own step",
+            )
+        )
+    if findings.failure:
+        rows.append(Row("failure", findings.failure, "what it left open is taken as not possible"))
+    return Report(
+        fmu=fmu.path,
+        sha256=fmu.sha256,
+        rows=tuple(rows),
+        outputs=seen.outputs,
+        kinds=kinds,
+        restart=findings.restart,
+        snapshots=not seen.snapshots,
+        serialises=not seen.serialises,
+        experiment=findings.experiment,
+        still=seen.still,
+        undriven=undriven,
+        starts_anywhere=starts_anywhere,
+    )
+
+
+def _outputs_row(seen: Probe, kinds: dict[str, Kind]) -> Row:
+    said = "; ".join(f"{name} {kind.value}" for name, kind in kinds.items())
+    if seen.outputs is None:
+        return Row("outputs", said, "each is read where it belongs; leave plant.outputs out")
+    order = f'plant.outputs = "{seen.outputs}"'
+    if not set(kinds.values()) & {*BEFORE, *AFTER}:
+        order += ", the order that FMI allows, without proof"
+    if Kind.END in kinds.values():
+        order += "; figures that need the cost at the sample's begin are refused"
+    return Row("outputs", said, order)
+
+
+def _restart_row(findings: Findings) -> Row:
+    consequence = {
+        Restart.RESET: "each episode begins by a reset",
+        Restart.FRESH: "each episode is a new instance: a reset was not seen to repeat the start",
+        Restart.NEVER: "one episode a process: neither a reset nor a second instance is possible",
+    }
+    return Row("episodes", findings.restart.value, consequence[findings.restart])
+
+
+def _still_row(still: dict[str, bool]) -> Row:
+    moves = {True: "moves outputs only", False: "moves nothing"}
+    names = "; ".join(f"{name} {moves[outputs]}" for name, outputs in still.items())
+    consequence = "no controller can act by them so: plant.parameters may set an input that enables"
+    return Row("actions that move no state", names or "none", consequence if still else "")
+
+
+def _ability_row(subject: str, fault: str, use: str) -> Row:
+    return Row(subject, fault or "gives the same steps again", "not used" if fault else use)
+
+
+def _experiment_row(experiment: Experiment, asked: Experiment) -> Row:
+    stop = "none" if experiment.stop_time is None else f"{experiment.stop_time:g} s"
+    tolerance = "none" if experiment.tolerance is None else f"{experiment.tolerance:g}"
+    needed = experiment.stop_time is not None and asked.stop_time is None
+    return Row(
+        "experiment",
+        f"start {experiment.start_time:g} s, stop {stop}, tolerance {tolerance}",
+        "it does not run without a stop time: no step goes beyond it, plant.stop_time sets another"
+        if needed
+        else "plant.start_time, plant.stop_time, plant.tolerance set others",
+    )

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from controllers.errors import ControllerError
 from controllers.functions import c_source
 from controllers.problem import Problem
-from controllers.rti.preparation import Exact, SampleFunctions, stage_linearisation
+from controllers.rti.preparation import RESIDUAL, Exact, SampleFunctions, stage_linearisation
 from controllers.theta import Parameters
 from cosim.scenario import Scenario
 
@@ -122,6 +122,17 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         vectors += ["penalty_linear", "penalty_quadratic"]
         slack = {kind: f"((void)(theta), PENALTY_{kind.upper()})" for kind in slack}
     arrays = {name.upper(): getattr(problem, name) for name in vectors}
+    scale, rule = problem.scale, made.hessian
+    arrays |= {
+        "SCALE_STATE": scale.state,
+        "SCALE_ACTION": scale.action,
+        "STATE_PRICE": scale.state_price,
+        "ACTION_PRICE": scale.action_price,
+        "BEND": rule.bend.reshape(-1),
+        "SLOPE": rule.slope,
+    }
+    if isinstance(rule, Exact):
+        arrays["METRIC"] = rule.metric.reshape(-1)
     arrays["DISCOUNTS"] = gamma ** np.arange(horizon)
     arrays["SLACK_DISCOUNTS"] = gamma ** np.arange(1, horizon + 1)
     return _filled(
@@ -130,6 +141,7 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         arrays="\n".join(_array(name, values) for name, values in arrays.items()),
         end_discount=repr(float(gamma**horizon)),
         floor=repr(Exact.FLOOR),
+        residual=repr(RESIDUAL),
         rule=made.hessian.source,
         solver=SOLVERS[stagewise][0],
         stagewise=str(int(stagewise)),

@@ -21,7 +21,7 @@ from cosim.validation import instead
 
 RESIDUAL = 1e-8
 """Largest KKT residual of a QP that counts as solved."""
-TINY = 1e-300
+TINY = 1e-30
 """What a size is at least, so that it can divide."""
 
 
@@ -331,7 +331,8 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
         value += ca.bilin(weights[k], w) / 2 + ca.dot(q[:, k], w)
         columns = slice(k * n, (k + 1) * n)
         xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ v[:, k] + given["r"][:, k])
-        outside = ca.fmax(lower - xi[k + 1], xi[k + 1] - upper)
+        above = xi[k + 1] - symbols["x_u"] / state + x_s / state
+        outside = ca.fmax(lower - xi[k + 1], above)
         t.append(ca.fmax(outside, 0))
         value += gamma ** (k + 1) * (ca.dot(w_sigma, t[k]) + ca.dot(W_sigma, t[k] ** 2))
     value += ca.bilin(L_N, xi[horizon]) / 2 + ca.dot(q_N, xi[horizon])
@@ -486,9 +487,9 @@ class GaussNewton:
         self.discounts = problem.discount ** np.arange(horizon)
         self._end = problem.discount**horizon
         scale = problem.scale
-        # A second derivative, a first one and so on of a cost in the model's units, scaled.
-        self._bend = np.outer(scale.both, scale.both) / scale.cost
-        self._slope = scale.both / scale.cost
+        # What scales a cost's second and first derivatives in the model's units.
+        self.bend = np.outer(scale.both, scale.both) / scale.cost
+        self.slope = scale.both / scale.cost
         self.L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
         self.q = prepared.inputs["q"].reshape(horizon, n + m)
         self._L_N, self._q_N = prepared.inputs["L_N"], prepared.inputs["q_N"]
@@ -496,10 +497,10 @@ class GaussNewton:
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over a new θ: its costs, which no linearisation point changes here."""
         n = self._q_N.size
-        self.L[:] = 2 * self.discounts[:, None, None] * parameters["B_l"] * self._bend
-        self.q[:] = self.discounts[:, None] * parameters["b_l"] * self._slope
-        self._L_N[:] = (2 * self._end * parameters["B_Vf"] * self._bend[:n, :n]).reshape(-1)
-        self._q_N[:] = self._end * parameters["b_Vf"] * self._slope[:n]
+        self.L[:] = 2 * self.discounts[:, None, None] * parameters["B_l"] * self.bend
+        self.q[:] = self.discounts[:, None] * parameters["b_l"] * self.slope
+        self._L_N[:] = (2 * self._end * parameters["B_Vf"] * self.bend[:n, :n]).reshape(-1)
+        self._q_N[:] = self._end * parameters["b_Vf"] * self.slope[:n]
 
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write L and q for the points (N, n), (N, m); return the cost's constant."""
@@ -525,7 +526,7 @@ class Exact(GaussNewton):
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = problem.reference
         self._ranges = problem.scale.ranges
-        self._metric = np.outer(self._ranges, self._ranges) / problem.scale.level
+        self.metric = np.outer(self._ranges, self._ranges) / problem.scale.level
         x, u, symbols = _point(problem, blocks)
         chi = ca.SX.sym("chi", n)
         stage = stage_function(
@@ -563,19 +564,19 @@ class Exact(GaussNewton):
             L[:] = np.nan
             return np.nan
         if self.lifts:
-            values, vectors = np.linalg.eigh(raw * self._metric)
+            values, vectors = np.linalg.eigh(raw * self.metric)
             floor = np.asarray(self.FLOOR * discounts[:, None], dtype=np.float64)
             self.spectrum = Spectrum(values, vectors, floor, self._ranges)
             # What is to be lifted is added: what is above the floor keeps its digits.
             rise = np.maximum(floor - values, 0.0)
-            raw += (vectors * rise[:, None, :]) @ vectors.transpose(0, 2, 1) / self._metric
+            raw += (vectors * rise[:, None, :]) @ vectors.transpose(0, 2, 1) / self.metric
         else:
             self.spectrum = None
         at = np.concatenate([x, u], axis=1) - self._reference
         curved = np.einsum("kij,kj->ki", raw, at)
         flat = 2 * discounts[:, None] * (at @ self._B)
-        L[:] = raw * self._bend
-        q[:] = (flat + discounts[:, None] * self._b - curved) * self._slope
+        L[:] = raw * self.bend
+        q[:] = (flat + discounts[:, None] * self._b - curved) * self.slope
         return float((at * (curved - flat)).sum() / 2)
 
 

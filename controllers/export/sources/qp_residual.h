@@ -6,7 +6,7 @@
 
 /* Largest KKT residual: stationarity relative to its terms, bounds and rows by their proximal
  * operators, each zero at a solution only. */
-static double qp_residual(const Qp *qp, const QpWork *work) {
+static inline double qp_residual(const Qp *qp, const QpWork *work) {
     double curvature[QP_N] = {0.0}, pull[QP_N] = {0.0}, y[QP_ROWS];
     double stationarity = 0.0, scale = 1.0, largest = 0.0;
     for (int i = 0; i < QP_N; i++)

@@ -127,7 +127,6 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         "SCALE_STATE": scale.state,
         "SCALE_ACTION": scale.action,
         "STATE_PRICE": scale.state_price,
-        "ACTION_PRICE": scale.action_price,
         "BEND": rule.bend.reshape(-1),
         "SLOPE": rule.slope,
     }
@@ -142,6 +141,7 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         end_discount=repr(float(gamma**horizon)),
         floor=repr(Exact.FLOOR),
         residual=repr(RESIDUAL),
+        cost_scale=repr(problem.scale.cost),
         rule=made.hessian.source,
         solver=SOLVERS[stagewise][0],
         stagewise=str(int(stagewise)),

@@ -51,7 +51,7 @@ void engine_batch(RtiPrepared *prepared, RtiSolved *solved, RtiWork *work, long 
         rti_gradient(prepared, solved);
         memcpy(slope, solved->read + READ_chi, N_X * sizeof(double));
         memcpy(slope + N_X, solved->gradient, sizeof solved->gradient);
-        for (int i = 0; a && i < N_U; i++) slope[N_X + N_THETA + i] = -solved->nu[i] * ACTION_PRICE[i];
+        for (int i = 0; a && i < N_U; i++) slope[N_X + N_THETA + i] = -solved->nu[i] * (COST_SCALE / SCALE_ACTION[i]);
         if (!a && rti_policy(prepared, solved, work, slope + VALUE) != QP_SOLVED) failed[k] = -1;
     }
 }

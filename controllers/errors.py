@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, ClassVar
 
-from cosim.errors import CosimError
+from cosim.errors import CosimError, CosimWarning
 
 
 class ControllerError(CosimError):
@@ -13,6 +14,10 @@ class ControllerError(CosimError):
 
 class ModelError(ControllerError):
     """The control model or the control problem is malformed."""
+
+
+class ModelWarning(CosimWarning):
+    """The control model can be used, but not as fast or as accurately as its user may think."""
 
 
 class ParameterError(ControllerError):
@@ -41,3 +46,12 @@ class QpError(ControllerError):
         super().__init__(message)
         self.status = status
         self.qp = qp
+
+
+def warn(message: str, category: type[CosimWarning]) -> None:
+    """Warn the user, once for each message."""
+    warnings.warn_explicit(message, category, category.__module__, 0, registry=_WARNED)
+
+
+_WARNED: dict[Any, Any] = {}
+"""The messages that were shown: Python's own record goes by the line of code that warns."""

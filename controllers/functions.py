@@ -62,11 +62,14 @@ class StackedFunction:
         )
         shared = shared or {}
         sizes = {name: argument.numel() for name, argument in arguments.items()}
+        for name_, array in shared.items():
+            _check_array(name_, array, sizes[name_])
         own = {name: size for name, size in sizes.items() if name not in shared}
         all_sizes = own | {"stack": function.numel_out(0)} | dict(room or {})
-        self.memory: Vector = np.zeros(sum(all_sizes.values())) if memory is None else memory
+        total = sum(all_sizes.values())
+        self.memory: Vector = np.zeros(total) if memory is None else memory
+        _check_array("memory", self.memory, total)
         self.places = consecutive(all_sizes)
-        assert all(a.shape == (sizes[name],) and a.flags.c_contiguous for name, a in shared.items())
         self.inputs = {
             name: shared[name] if name in shared else self.memory[self.places[name]]
             for name in sizes
@@ -82,8 +85,11 @@ class StackedFunction:
         self.shapes = {name: result.shape for name, result in results.items()}
 
     def __call__(self) -> None:
-        """Evaluate at `inputs`, into `stack`."""
-        self._evaluate()
+        """Evaluate at `inputs`, into `stack`; NaN where a solver inside the function fails."""
+        try:
+            self._evaluate()
+        except RuntimeError:  # CasADi's, of a root finder or an integrator say
+            self.stack[:] = np.nan
 
     def finite(self) -> bool:
         """Whether all results are finite."""
@@ -99,6 +105,53 @@ class StackedFunction:
         return flat if columns == 1 else flat.reshape(columns, rows)
 
 
+def _check_array(name: str, array: Vector, size: int) -> None:
+    """CasADi reads and writes raw memory: a wrong array would be a wrong number or a crash."""
+    if array.shape != (size,) or array.dtype != np.float64 or not array.flags.c_contiguous:
+        raise ValueError(f"{name} must be {size} doubles in a row, not {array.dtype} {array.shape}")
+
+
+IN_C = frozenset(
+    {
+        "SXFunction",
+        "MXFunction",
+        "Map",
+        "Switch",
+        "LinearInterpolant",
+        "LinearInterpolantJac",
+        "BSplineInterpolant",
+    }
+)
+"""CasADi's classes of functions whose C needs nothing but itself and the mathematical library."""
+
+
+def not_in_c(functions: Sequence[ca.Function]) -> str | None:
+    """Say which function inside of these cannot be C by itself; None where all can.
+
+    Such are externals, callbacks, integrators, iterative root finders and optimisers. CasADi's
+    interpreter evaluates them.
+    """
+    for function in functions:
+        for part in [function, *function.find_functions()]:
+            if part.class_name() not in IN_C:
+                return f"the model calls '{part.name()}', a {part.class_name()} of CasADi"
+    return None
+
+
+def work_sizes(prefix: str, function: ca.Function) -> dict[str, int]:
+    """Sizes that a call of a function's C needs, by the names of constants that begin so.
+
+    They are the lengths of `arg`, `res`, `iw` and `w`. The first two exceed the numbers of inputs
+    and outputs where the function calls others: CasADi keeps their pointers behind its own.
+    """
+    return {
+        f"{prefix}_ARG": function.sz_arg(),
+        f"{prefix}_RES": function.sz_res(),
+        f"{prefix}_IW": function.sz_iw(),
+        f"{prefix}_W": function.sz_w(),
+    }
+
+
 # Of two zeros of unlike sign CasADi's interpreter returns the first, the C library the second.
 _TIES = (
     ("return fmax(x, y);", "return y > x || x != x ? y : x;"),
@@ -110,10 +163,15 @@ def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     """C99 source of the functions; it needs the mathematical library alone.
 
     Each becomes `int NAME(const double** arg, double** res, long long* iw, double* w, int mem)`,
-    with `NAME_work` for the sizes of its work vectors. Compiled without contraction of products
+    whose arrays must have the sizes of `work_sizes`, and which returns 0 unless it fails. None of
+    them needs a memory checked out, so `mem` is 0. Compiled without contraction of products
     and sums (-ffp-contract=off) and without fast-math it gives the interpreter's bytes. The same
-    functions give the same source. The names of its helpers begin with `name`.
+    functions give the same source. The names of its helpers begin with `name`. Raises
+    ControllerError where a function cannot be C by itself (`not_in_c`).
     """
+    reason = not_in_c(functions)
+    if reason is not None:
+        raise ControllerError(f"{reason}, which cannot be written as C of its own")
     generator = ca.CodeGenerator(f"{name}.c")
     for function in functions:
         generator.add(function)

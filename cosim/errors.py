@@ -5,6 +5,10 @@ class CosimError(Exception):
     """Base of every error that the four packages raise on bad input or a failed run."""
 
 
+class CosimWarning(UserWarning):
+    """Base of every warning that the four packages give; its message is one line for the user."""
+
+
 class ArgumentError(CosimError, TypeError):
     """A function was called with a keyword that it does not have."""
 

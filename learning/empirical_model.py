@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from controllers.export.core import core
-from controllers.functions import c_source, library
+from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
@@ -90,15 +90,25 @@ class Features:
         self._function = ca.Function("features", given, [y, G.T, h], names, ["y", "G", "h"])
         self.outputs, self.count = G.shape
         self.inputs = problem.n_states + problem.n_actions
-        n, shape = problem.n_states, {"K": self.outputs, "P": self.count}
+        self.compiled = None
+        if not_in_c([self._function]) is not None:
+            return
+        constants = {
+            "N_X": problem.n_states,
+            "N_IN": self.inputs,
+            "K": self.outputs,
+            "P": self.count,
+            **work_sizes("FEATURES", self._function),
+        }
         path = library(
             {
-                "sizes.h": _definitions({"N_X": n, "N_IN": self.inputs, **shape}),
+                "sizes.h": _definitions(constants),
                 "nominal.h": "#define CASADI_SYMBOL_EXPORT static\n" + c_source([self._function]),
                 "features.c": (files("learning") / "features.c").read_bytes(),
             }
         )
-        self.compiled = None if path is None else ctypes.CDLL(str(path)).features_at
+        if path is not None:
+            self.compiled = ctypes.CDLL(str(path)).features_at
 
     def __call__(self, inputs: Array, c: Array) -> tuple[Array, Array, Array]:
         """y (M, K), its derivative by c, G (M, K, p), and h (M, K) at inputs (s, a), (M, n+m)."""
@@ -318,14 +328,11 @@ class Rollout:
     def __init__(self, problem: Problem, parameters: Parameters, features: Features) -> None:
         self._problem, self._features = problem, features
         self._controller = RtiNmpc(problem, parameters)
+        self.compiled = None
         function = features.mean
-        sizes = {
-            "K": features.outputs,
-            "NOMINAL_ARG": function.sz_arg(),
-            "NOMINAL_RES": function.sz_res(),
-            "NOMINAL_W": function.sz_w(),
-            "NOMINAL_IW": function.sz_iw(),
-        }
+        if not_in_c([function]) is not None:
+            return
+        sizes = {"K": features.outputs, **work_sizes("NOMINAL", function)}
         sources: dict[str, str | bytes] = {
             **core(problem, parameters).sources,
             "sizes.h": _definitions(sizes),
@@ -334,7 +341,8 @@ class Rollout:
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
         path = library(sources)
-        self.compiled = None if path is None else ctypes.CDLL(str(path)).rollout
+        if path is not None:
+            self.compiled = ctypes.CDLL(str(path)).rollout
 
     def __call__(
         self, thetas: Sequence[Array], start: Array, model: EmpiricalModel, picks: NDArray[np.int32]

@@ -30,7 +30,7 @@ int rollout(const double theta[], const double start[], const double c[], const 
         const double *arguments[NOMINAL_ARG] = {inputs, inputs + N_X, c};
         double *results[NOMINAL_RES] = {predicted, h};
         long long int iw[NOMINAL_IW + 1];
-        nominal(arguments, results, iw, w, 0);
+        if (nominal(arguments, results, iw, w, 0)) predicted[0] = NAN;
         for (int i = 0; i < K; i++) {
             predicted[i] += W[i * (N_IN + 1)];
             for (int j = 0; j < N_IN; j++) predicted[i] += W[i * (N_IN + 1) + 1 + j] * inputs[j];

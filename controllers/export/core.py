@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
-from controllers.functions import c_source
+from controllers.functions import c_source, not_in_c, work_sizes
 from controllers.problem import Problem
-from controllers.rti.preparation import RESIDUAL, Exact, SampleFunctions, stage_linearisation
+from controllers.rti.preparation import RESIDUAL, Exact, SampleFunctions
 from controllers.theta import Parameters
 from cosim.scenario import Scenario
 
@@ -54,10 +54,15 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
 
     It computes as `RtiNmpc` does with the backend `daqp`, by a QP solver of its own; the
     parameters θ stay an input. Raises ControllerError where `hessian` is not `gauss-newton` or
-    `exact`, or the horizon is too long for a thread's stack.
+    `exact`, the horizon is too long for a thread's stack, or the model calls what cannot be C.
     """
     parameters.require_well_posed()
     made = SampleFunctions(problem, parameters.blocks, hessian)
+    if (reason := why_not_in_c(made)) is not None:
+        raise ControllerError(
+            f"a controller with the model '{problem.model.name}' cannot be exported: {reason}; "
+            "write it as expressions or as a table (casadi.interpolant)"
+        )
     if (size := stack_needed(made)) > STACK_LIMIT:
         raise ControllerError(
             f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "
@@ -72,11 +77,20 @@ def controller_sources(made: SampleFunctions, *, stagewise: bool = False) -> dic
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
     unused = {"PREPARED", "EMBEDDED"} if stagewise else {"PREPARED"}
     called = [each.function for name, each in made.named.items() if name not in unused]
-    stage = stage_linearisation(made.problem, made.blocks)
-    sources["linearise.h"] = _functions("linearise", [stage])
+    sources["linearise.h"] = _functions("linearise", [made.stage])
     sources["functions.h"] = _functions("functions", called)
     sources["problem.h"] = _constants(made, stagewise).encode()
     return sources
+
+
+def why_not_in_c(made: SampleFunctions) -> str | None:
+    """What of a controller's model keeps it from being C (`not_in_c`); None where nothing does."""
+    return not_in_c(_written(made))
+
+
+def _written(made: SampleFunctions) -> list[ca.Function]:
+    """The functions that become C; the preparation's graph maps `stage` and is done by hand."""
+    return [made.stage, *(part.function for name, part in made.named.items() if name != "PREPARED")]
 
 
 def stack_needed(made: SampleFunctions) -> int:
@@ -91,16 +105,16 @@ def stack_needed(made: SampleFunctions) -> int:
     own = made.preparation.memory.size + made.readout.memory.size
     solver = limits * (variables + limits + 10) + 2 * limits + variables * (variables + 1)
     condensing = (horizon + 5) * n * (variables + n + 1)
-    called = (each.function.sz_w() for name, each in made.named.items() if name != "PREPARED")
-    shared = max(solver, condensing, *called)
+    work = [sum(work_sizes("", function).values()) for function in _written(made)]
+    shared = max(solver, condensing, *work)
     return 4000 + round(1.2 * 8 * (own + shared))
 
 
 def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
     """CasADi's C with every function static and without the compiler's remarks on it."""
-    own = re.compile(r"^casadi_real casadi_|^void casadi_|^casadi_int casadi_", re.MULTILINE)
+    helper = re.compile(r"^(?:const )?(?:casadi_real|casadi_int|void|int)\*? casadi_", re.MULTILINE)
     code = c_source(functions, name)
-    code = own.sub(lambda found: f"static {found.group()}", code)
+    code = helper.sub(lambda found: f"static {found.group()}", code)
     return _filled("functions.h.in", code=code).encode()
 
 
@@ -112,9 +126,8 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
     for prefix, call in made.named.items():
         sizes |= {f"{prefix}_{name}": part.start for name, part in call.slices.items()}
         sizes[f"{prefix}_SIZE"] = call.stack.size
-        of = call.function
-        work = {"ARG": of.sz_arg(), "RES": of.sz_res(), "IW": of.sz_iw(), "W": of.sz_w()}
-        sizes |= {f"{prefix}_{name}": size for name, size in work.items()}
+        sizes |= work_sizes(prefix, call.function)
+    sizes |= work_sizes("LINEARISE", made.stage)
     sizes |= {f"THETA_{name}": part.start for name, part in blocks.slices.items()}
     vectors = ["reference_state", "reference_action", "action_lower", "action_upper"]
     slack = {"linear": "((theta) + THETA_w_sigma)", "quadratic": "((theta) + THETA_W_sigma)"}

@@ -13,8 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.export.core import SOURCES, STACK_LIMIT, STATUSES, controller_sources, stack_needed
+from controllers.errors import ControllerError, ModelWarning, ParameterError, QpError, warn
+from controllers.export.core import (
+    SOURCES,
+    STACK_LIMIT,
+    STATUSES,
+    controller_sources,
+    stack_needed,
+    why_not_in_c,
+)
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
 from controllers.qp import (
@@ -453,7 +460,12 @@ class RtiNmpc:
         same to rounding and to DAQP's accuracy (`tests/controllers/rti/test_engine.py` holds the
         bounds).
         """
-        if not self._compilable or (samples < LONG and switch() != "now"):
+        if not self._compilable or (samples < LONG and switch() != "now") or switch() == "never":
+            return
+        reason = why_not_in_c(self._functions)
+        if reason is not None:
+            self._compilable = False
+            warn(f"{reason}: the controller is not compiled, which is slower", ModelWarning)
             return
         self._engine = Engine.compile(self._functions)
         self.functions = INTERPRETED if self._engine is None else COMPILED

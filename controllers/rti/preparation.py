@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -599,6 +600,11 @@ class SampleFunctions:
         self.readout = readout(problem, blocks, self.preparation)
         self.embedding = embedding(problem, blocks, self.preparation, self.readout)
         self.hessian = HESSIANS[hessian](problem, blocks, self.preparation)
+
+    @cached_property
+    def stage(self) -> ca.Function:
+        """The linearisation of one stage, which C calls for each."""
+        return stage_linearisation(self.problem, self.blocks)
 
     @property
     def named(self) -> dict[str, StackedFunction]:

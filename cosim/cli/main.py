@@ -8,6 +8,8 @@ import os
 import re
 import sys
 import traceback
+import warnings
+from collections.abc import Callable
 from inspect import getdoc
 from itertools import pairwise
 from typing import Annotated, Any
@@ -29,7 +31,7 @@ from cosim.cli import (
     train,
     view,
 )
-from cosim.errors import CosimError
+from cosim.errors import CosimError, CosimWarning
 from cosim.files import protect
 from cosim.processes import Finished, Interrupted, Terminated, command_process, unwound
 
@@ -181,8 +183,24 @@ def main() -> None:
     gc.set_threshold(100_000)
     atexit.register(gc.freeze)
     _open_streams()
+    warnings.formatwarning = _format_warning
     with command_process():
         _run()
+
+
+def _format_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+    *,
+    default: Callable[..., str] = warnings.formatwarning,
+) -> str:
+    """One line of our own warnings; those of others as Python has them."""
+    if issubclass(category, CosimWarning):
+        return f"warning: {' '.join(str(message).split())}\n"
+    return default(message, category, filename, lineno, line)
 
 
 def _open_streams() -> None:

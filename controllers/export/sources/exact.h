@@ -38,7 +38,7 @@ static double stage_costs(const double x[], const double u[], const double costa
         const double *arguments[CURVATURE_ARG] = {x, u, costates, theta};
         double *results[CURVATURE_RES] = {curved}, w[CURVATURE_W + 1];
         long long int iw[CURVATURE_IW + 1];
-        curvature(arguments, results, iw, w, 0);
+        if (curvature(arguments, results, iw, w, 0)) curved[0] = NAN;
     }
     for (int k = 0; k < HORIZON; k++) {
         double B[N_W * N_W], raw[N_W][N_W], matrix[N_W][N_W], vectors[N_W][N_W], at[N_W];

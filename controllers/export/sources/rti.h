@@ -77,11 +77,14 @@ static int well_posed(const double theta[]) {
  * and the compiler makes several stages at a time of it. */
 static QP_APART void rti_linearise(RtiPrepared *prepared) {
     double *const A = prepared->stack + PREPARED_A, *const B = prepared->stack + PREPARED_B;
+    double *const r = prepared->stack + PREPARED_r;
     for (int k = 0; k < HORIZON; k++) {
-        const double *arguments[] = {prepared->x[k], prepared->u[k], prepared->theta};
-        double *results[] = {A + k * N_X * N_X, B + k * N_X * N_U,
-                             prepared->stack + PREPARED_r + k * N_X};
-        linearise(arguments, results, 0, 0, 0);
+        const double *arguments[LINEARISE_ARG] = {prepared->x[k], prepared->u[k], prepared->theta};
+        double *results[LINEARISE_RES] = {A + k * N_X * N_X, B + k * N_X * N_U, r + k * N_X};
+        double w[LINEARISE_W + 1];
+        long long int iw[LINEARISE_IW + 1];
+        /* A function inside the model, such as a root finder, may fail. */
+        if (linearise(arguments, results, iw, w, 0)) r[k * N_X] = NAN;
     }
 }
 

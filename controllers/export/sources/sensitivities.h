@@ -12,7 +12,7 @@ static void rti_gradient(const RtiPrepared *prepared, RtiSolved *solved) {
         solved->lam,    prepared->x[0], prepared->u[0],  prepared->theta};
     double *results[GRADIENT_RES] = {solved->gradient}, w[GRADIENT_W + 1];
     long long int iw[GRADIENT_IW + 1];
-    value_gradient(arguments, results, iw, w, 0);
+    if (value_gradient(arguments, results, iw, w, 0)) solved->gradient[0] = NAN;
 }
 
 /* dπ/dθ (N_THETA by action), then dπ/ds (N_X by action), of a solution without an enforced action;
@@ -30,7 +30,7 @@ static int rti_policy(const RtiPrepared *prepared, const RtiSolved *solved, RtiW
         dlam[0]};
     double *results[POLICY_RES] = {policy}, w[POLICY_W + 1];
     long long int iw[POLICY_IW + 1];
-    policy_jacobian(arguments, results, iw, w, 0);
+    if (policy_jacobian(arguments, results, iw, w, 0)) policy[0] = NAN;
     return QP_SOLVED;
 }
 

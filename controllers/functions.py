@@ -19,7 +19,7 @@ import numpy as np
 from controllers.errors import ControllerError
 from cosim.files import cache_folder, lock, temporary_folder
 from cosim.processes import child_process
-from cosim.protocols import Vector
+from cosim.protocols import Matrix, Vector
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 
@@ -34,7 +34,7 @@ class StackedFunction:
     """A CasADi function of expressions whose arguments and results live in fixed NumPy arrays.
 
     `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
-    read the results by `part`. A call allocates nothing. All results share one flat array, `stack`,
+    read the results by `part`, or `matrix`. A call allocates nothing. All results share one flat array, `stack`,
     so that one copy keeps them all. The inputs follow each other in one array but for the `shared`
     ones, which are read from other memory, such as another function's output. Own inputs
     and results are one array, `memory`: a given one, or one with `room` behind them for more, by
@@ -96,13 +96,16 @@ class StackedFunction:
         return bool(np.isfinite(self.stack).all())
 
     def part(self, name: str, memory: Vector | None = None) -> Vector:
-        """View of a part of the memory, or of a copy of it: flat, a result with columns by columns.
+        """View of a part of the memory, or of a copy of it, flat: a result by its columns."""
+        return (self.memory if memory is None else memory)[self.places[name]]
 
-        That is its transpose in row-major order, of shape (columns, rows).
+    def matrix(self, name: str, memory: Vector | None = None) -> Matrix:
+        """View of a result as the transpose of its expression: shape (columns, rows).
+
+        What is a matrix is the caller's to say: one column may be either.
         """
-        flat = (self.memory if memory is None else memory)[self.places[name]]
-        rows, columns = self.shapes.get(name, (0, 1))
-        return flat if columns == 1 else flat.reshape(columns, rows)
+        rows, columns = self.shapes[name]
+        return self.part(name, memory).reshape(columns, rows)
 
 
 def _check_array(name: str, array: Vector, size: int) -> None:

@@ -99,7 +99,7 @@ class Prepared:
 
     def part(self, name: str) -> Vector:
         """An input, result or other part of the preparation's memory, flat."""
-        return self.functions.preparation.part(name, self.memory).reshape(-1)
+        return self.functions.preparation.part(name, self.memory)
 
     @cached_property
     def point(self) -> LinearisationPoint:
@@ -130,8 +130,11 @@ class RtiSolution:
     enforced: bool = False
     status: str = "solved"
 
-    def _part(self, name: str) -> Matrix:
+    def _part(self, name: str) -> Vector:
         return self.prepared.functions.readout.part(name, self.memory)
+
+    def _by_stage(self, name: str) -> Matrix:
+        return self.prepared.functions.readout.matrix(name, self.memory)
 
     @cached_property
     def multipliers(self) -> QpSolution:
@@ -149,7 +152,7 @@ class RtiSolution:
     @cached_property
     def predicted_states(self) -> Matrix:
         """Predicted states x_0 … x_N, shape (N+1, n)."""
-        return self._part("xi") + self.prepared.functions.problem.reference_state
+        return self._by_stage("xi") + self.prepared.functions.problem.reference_state
 
     @cached_property
     def predicted_actions(self) -> Matrix:
@@ -168,7 +171,7 @@ class RtiSolution:
     @property
     def slack(self) -> Matrix:
         """Slack of the soft state bounds at stages 1 … N, shape (N, n)."""
-        return self._part("t")
+        return self._by_stage("t")
 
     @property
     def costates(self) -> Matrix:
@@ -177,7 +180,7 @@ class RtiSolution:
         χ_0 is dV/ds or dQ/ds. At a true bound the penalty of s itself has a kink, and half of its
         slope is taken.
         """
-        return self._part("chi")
+        return self._by_stage("chi")
 
     @property
     def action_gradient(self) -> Vector:
@@ -262,7 +265,7 @@ class RtiSolution:
     def _write_solution(self, function: StackedFunction) -> None:
         inputs, prepared = function.inputs, self.prepared
         for name in SOLUTION:
-            inputs[name][:] = self._part(name).reshape(-1)
+            inputs[name][:] = self._part(name)
         for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
         if "M" in inputs:

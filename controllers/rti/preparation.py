@@ -270,7 +270,7 @@ def embedding(
         "embedding",
         {"s": s, "theta": symbols["theta"], **prior},
         {"f": prior["f"] + prior["F"].T @ xi, "lower": lower, "upper": upper},
-        {name: prepared.part(name).reshape(-1) for name in prior}
+        {name: prepared.part(name) for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
@@ -367,10 +367,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_chi": ca.horzcat(*(part / gamma for part in costates[2:]), costates[-1]),
             "residual": _residual(given, xi, chi, limits, discounts),
         },
-        {
-            name: prepared.part(name).reshape(-1)
-            for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
-        },
+        {name: prepared.part(name) for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")},
         room={"f": horizon * m}
         | dict.fromkeys(("row_lower", "row_upper"), horizon * n)
         | {"iterations": 1, "gradient": blocks.size},
@@ -616,7 +613,8 @@ class SampleFunctions:
         """The QP in the memory of preparation and read-out, `before` and `after`, or copies."""
         vectors = ("f", "lower", "upper", "row_lower", "row_upper")
         return SoftQp(
-            rows=self.preparation.part("Gamma", before),
-            **{name: self.preparation.part(name, before) for name in ("H", "w", "W")},
+            H=self.preparation.matrix("H", before),
+            rows=self.preparation.matrix("Gamma", before),
+            **{name: self.preparation.part(name, before) for name in ("w", "W")},
             **{name: self.readout.part(name, after) for name in vectors},
         )

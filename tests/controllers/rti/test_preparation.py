@@ -47,7 +47,7 @@ def simulate(prepared, xi_0, v):
     A, B = prepared.part("A").reshape(N, n, n), prepared.part("B").reshape(N, n, m)
     xi = [xi_0]
     for k in range(N):
-        xi.append(A[k] @ xi[k] + B[k] @ v[k] + prepared.part("r")[k])
+        xi.append(A[k] @ xi[k] + B[k] @ v[k] + prepared.matrix("r")[k])
     return np.array(xi)
 
 
@@ -82,7 +82,7 @@ def test_the_linear_model_touches_the_nonlinear_one_at_its_point(functions, case
     A, B = prepared.part("A").reshape(N, n, n), prepared.part("B").reshape(N, n, m)
     for k in range(N):
         xi, v = point.x[k] - problem.reference_state, point.u[k] - problem.reference_action
-        linear = A[k] @ xi + B[k] @ v + prepared.part("r")[k] + problem.reference_state
+        linear = A[k] @ xi + B[k] @ v + prepared.matrix("r")[k] + problem.reference_state
         exact = f(point.x[k], point.u[k], problem.model.nominal_disturbance, p)
         np.testing.assert_allclose(linear, np.array(exact).ravel() + parameters["c_f"], rtol=1e-13)
 
@@ -91,7 +91,7 @@ def test_condensed_states_equal_a_stage_wise_simulation(functions, case, rng):
     prepared, _ = functions
     xi_0, v = rng.normal(size=n), rng.normal(size=(N, m)) * 20
     condensed = (
-        prepared.part("Gamma") @ v.ravel() + prepared.part("Phi") @ xi_0 + prepared.part("g")
+        prepared.matrix("Gamma") @ v.ravel() + prepared.matrix("Phi") @ xi_0 + prepared.part("g")
     )
     np.testing.assert_allclose(
         condensed.reshape(N, n), simulate(prepared, xi_0, v)[1:], rtol=0, atol=1e-11
@@ -100,8 +100,8 @@ def test_condensed_states_equal_a_stage_wise_simulation(functions, case, rng):
 
 def test_condensed_cost_differs_from_the_stage_wise_one_by_a_constant(functions, case, rng):
     prepared, _ = functions
-    xi_0, H = rng.normal(size=n), prepared.part("H")
-    f = prepared.part("f") + prepared.part("F") @ xi_0
+    xi_0, H = rng.normal(size=n), prepared.matrix("H")
+    f = prepared.part("f") + prepared.matrix("F") @ xi_0
     offsets = []
     for _ in range(20):
         v = rng.normal(size=(N, m)) * 20
@@ -117,10 +117,10 @@ def test_embedding_puts_the_state_into_gradient_and_limits(functions, case, prob
     embed()
     xi_0, v = s - problem.reference_state, rng.normal(size=(N, m)) * 20
     np.testing.assert_allclose(
-        embed.part("f"), prepared.part("f") + prepared.part("F") @ xi_0, rtol=1e-12, atol=1e-9
+        embed.part("f"), prepared.part("f") + prepared.matrix("F") @ xi_0, rtol=1e-12, atol=1e-9
     )
     # The rows' distances to their limits are the states' distances to their bounds.
-    y = prepared.part("Gamma") @ v.ravel()
+    y = prepared.matrix("Gamma") @ v.ravel()
     x = simulate(prepared, xi_0, v)[1:] + problem.reference_state
     for side, bound in (("lower", "x_l"), ("upper", "x_u")):
         np.testing.assert_allclose(

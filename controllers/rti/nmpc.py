@@ -332,6 +332,34 @@ class Engine:
         path = library(sources)
         return None if path is None else cls(str(path), functions, stagewise)
 
+    def agrees(self, functions: Functions) -> bool:
+        """Whether the compiled functions give what CasADi's interpreter gives, at one state.
+
+        Compilers have faults: gcc 12 has been seen to drop the results of a model's linearisation.
+        The state is the reference, at the point and θ of the memory, which stays as it is.
+        """
+        prepared, read = functions.preparation, functions.readout
+        kept = prepared.memory.copy(), read.memory.copy()
+        gradient = functions.derivatives[0]
+        read.inputs["s"][:] = functions.problem.reference_state
+        same = True
+        if self.prepare() == 0:
+            linear = slice(prepared.places["A"].start, prepared.places["r"].stop)
+            compiled = prepared.memory[linear].copy()
+            prepared()
+            same = _alike(compiled, prepared.memory[linear])
+        if same and self.prepare() == 0 and self.feedback(False) == 0:
+            compiled = read.stack.copy()
+            read()
+            same = _alike(compiled, read.stack)
+            for name in gradient.inputs:
+                source = read if name in read.places else prepared
+                gradient.inputs[name][:] = source.memory[source.places[name]]
+            gradient()
+            same = same and _alike(read.memory[read.places["gradient"]], gradient.stack)
+        prepared.memory[:], read.memory[:] = kept
+        return same
+
     def prepare(self) -> int:
         """Preparation phase at the point and θ that the memory holds."""
         return int(self._library.engine_prepare(*self._value[:2]))
@@ -470,7 +498,15 @@ class RtiNmpc:
             self._compilable = False
             warn(f"{reason}: the controller is not compiled, which is slower", ModelWarning)
             return
-        self._engine = Engine.compile(self._functions)
+        engine = Engine.compile(self._functions)
+        if engine is not None and not engine.agrees(self._functions):
+            warn(
+                "the C compiler makes other numbers of the model than CasADi does: the controller "
+                "is not compiled, which is slower; set CC to another compiler",
+                ModelWarning,
+            )
+            engine = None
+        self._engine = engine
         self.functions = INTERPRETED if self._engine is None else COMPILED
         self._compilable = self._engine is not None  # where it failed once it is not tried again
         self._prepared = None
@@ -795,6 +831,12 @@ def compile_functions(controller: object, samples: int = LONG) -> None:
     """Compile the controller if it is an `RtiNmpc`; do nothing for others."""
     if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
         controller.compile(samples)
+
+
+def _alike(one: Vector, other: Vector) -> bool:
+    """Whether two vectors are equal but for rounding, relative to the largest entry."""
+    size = float(np.abs(other).max(initial=0.0))
+    return bool(np.allclose(one, other, rtol=0.0, atol=1e-9 * size, equal_nan=True))
 
 
 def _rows(kind: str, values: ArrayLike, count: int, shape: tuple[int, ...]) -> Vector:

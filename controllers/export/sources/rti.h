@@ -79,12 +79,17 @@ static QP_APART void rti_linearise(RtiPrepared *prepared) {
     double *const A = prepared->stack + PREPARED_A, *const B = prepared->stack + PREPARED_B;
     double *const r = prepared->stack + PREPARED_r;
     for (int k = 0; k < HORIZON; k++) {
+        /* In arrays of its own: gcc 12 has lost results that go through pointers into a larger one. */
+        double by_state[N_X * N_X], by_action[N_X * N_U], offset[N_X];
         const double *arguments[LINEARISE_ARG] = {prepared->x[k], prepared->u[k], prepared->theta};
-        double *results[LINEARISE_RES] = {A + k * N_X * N_X, B + k * N_X * N_U, r + k * N_X};
+        double *results[LINEARISE_RES] = {by_state, by_action, offset};
         double w[LINEARISE_W + 1];
         long long int iw[LINEARISE_IW + 1];
         /* A function inside the model, such as a root finder, may fail. */
-        if (linearise(arguments, results, iw, w, 0)) r[k * N_X] = NAN;
+        if (linearise(arguments, results, iw, w, 0)) offset[0] = NAN;
+        memcpy(A + k * N_X * N_X, by_state, sizeof by_state);
+        memcpy(B + k * N_X * N_U, by_action, sizeof by_action);
+        memcpy(r + k * N_X, offset, sizeof offset);
     }
 }
 

@@ -80,9 +80,7 @@ class Drawn:
         n = self.case.n
         linear = [sum(self.A[i, j] * x[j] for j in range(n)) for i in range(n)]
         driven = [sum(self.B[i, j] * u[j] for j in range(self.case.m)) for i in range(n)]
-        return [
-            p * linear[i] + driven[i] + self.bend[i] * x[i] * x[(i + 1) % n] for i in range(n)
-        ]
+        return [p * linear[i] + driven[i] + self.bend[i] * x[i] * x[(i + 1) % n] for i in range(n)]
 
     def step(self, x, u, p):
         """State after one sample, by Runge and Kutta's fourth-order method."""

@@ -25,7 +25,7 @@ class ConvergedNmpc(RtiNmpc):
     of Fully Converged NMPC): at the solution the QP with the exact Hessian has the programme's KKT
     matrix. SQP on that QP converges quadratically; where it is not convex the Hessian is lifted.
     Every step is a full one. `tolerance` is on the largest change of states, actions and, relative
-    to 1 + ‖χ‖∞, costates; QpError where `iterations` do not reach it.
+    to 1 + ‖χ‖∞, costates, all in units of `Problem.scale`; QpError where `iterations` do not reach it.
     """
 
     name = "converged"
@@ -39,7 +39,7 @@ class ConvergedNmpc(RtiNmpc):
         parameters: Parameters,
         *,
         backend: str | Callable[[], QpBackend] = "daqp",
-        tolerance: float = 1e-9,
+        tolerance: float = 1e-10,
         iterations: int = 100,
     ) -> None:
         self._tolerance, self._patience = tolerance, iterations
@@ -69,22 +69,26 @@ class ConvergedNmpc(RtiNmpc):
         return super()._solve_qp(s, a)
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
+        scale = self.problem.scale
         solution = self._solve_qp(s, a)
         for _ in range(self._patience):
             before, last = self._costates.copy(), solution
             self._linearise_at(solution.unshifted)
             solution = self._solve_qp(s, a)
+            states = (solution.predicted_states - last.predicted_states) / scale.state
+            actions = (solution.predicted_actions - last.predicted_actions) / scale.action
+            costates = (solution.costates[1:] - self._costates) / scale.state_price
+            size = 1 + float(np.abs(before / scale.state_price).max())
             change = max(
-                float(np.abs(solution.predicted_states - last.predicted_states).max()),
-                float(np.abs(solution.predicted_actions - last.predicted_actions).max()),
-                float(np.abs(solution.costates[1:] - self._costates).max())
-                / (1 + float(np.abs(before).max())),
+                float(np.abs(states).max()),
+                float(np.abs(actions).max()),
+                float(np.abs(costates).max()) / size,
             )
             if change < self._tolerance:
                 return self._read_out(s, a, solution) if self._hessian.lifts else solution
         raise QpError(
             f"SQP did not converge in {self._patience} iterations at "
-            f"s = {solution.predicted_states[0]}; last change {change:.1e}",
+            f"s = {solution.predicted_states[0]}; the last change was {change:.1e} of the ranges",
             status="not converged",
             qp=solution.qp.copy(),
         )

@@ -48,29 +48,12 @@ class Units:
     @classmethod
     def of(cls, problem: Problem) -> Units:
         """Units of a problem; raises ModelError where the multipliers cannot be computed."""
-        model, n, reference = problem.model, problem.n_states, problem.reference
-        widths = problem.upper - problem.lower
+        n, widths = problem.n_states, problem.upper - problem.lower
         both = np.array([10.0**power for power in np.rint(_power(widths))])
-        x, u, d, p = model.symbols()
-        w = ca.vertcat(x, u)
-        hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
-        rates = ca.jacobian(model.ode(x, u, d, p), w)
-        function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
-        nominal = (model.nominal_disturbance, model.nominal_parameters)
-        values = function(reference[:n], reference[n:], *nominal)
-        gradient, curvature = (value.full().reshape(-1) for value in values[:2])
-        rates = values[2].full()
-        near = ACTIVE * widths
-        below, above = reference <= problem.lower + near, reference >= problem.upper - near
-        found = multipliers(gradient * both, rates * both, below, above)
-        dearest = float(found[:n].max())
-        curved = float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max())
-        sizes = (dearest, curved, abs(problem.reference_cost))
-        # A size below rounding counts as zero.
-        least = np.finfo(np.float64).eps ** 0.5 * max(sizes)
-        powers = (float(10.0 ** (np.floor(_power(size)) + 1)) for size in sizes if size > least)
-        unit = next(powers, 1.0)
-        return cls(both[:n], both[n:], unit, dearest if dearest > least else 0.0)
+        sizes = _cost_sizes(problem, both)
+        largest = next(iter(sizes.values()), None)
+        unit = 1.0 if largest is None else float(10.0 ** (np.floor(_power(largest)) + 1))
+        return cls(both[:n], both[n:], unit, sizes.get("dearest", 0.0))
 
     def exact(self) -> Vector:
         """Slack weights just above the multipliers, to two digits, (n,): the least exact ones.
@@ -81,6 +64,88 @@ class Units:
             return 1e-3 * self.cost / self.state
         digit = 10.0 ** (np.floor(_power(self.dearest)) - 1)
         return np.asarray((np.floor(self.dearest / digit) + 1) * digit / self.state)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The one scaling of the controller's QP: x = `state`·x̃, u = `action`·ũ, cost = `cost`·c̃.
+
+    `state` (n,) and `action` (m,) are powers of two and `cost` is a power of four, so that scaling
+    changes no digit, in a Cholesky factor neither. They are those nearest to `ranges` (n+m,) and
+    `level`, which a change of units multiplies by exactly its own factors: what must not depend on
+    the units at all, such as the metric of `Exact`, is taken relative to these.
+    """
+
+    state: Vector
+    action: Vector
+    cost: float
+    ranges: Vector
+    level: float
+
+    @classmethod
+    def of(cls, problem: Problem) -> Scale:
+        """Scale of a problem: the widths between its bounds, and the size of its cost over them.
+
+        A state's range is at most a hundred times the violation at which the penalty's quadratic
+        term reaches the linear one, for a bound that is only there to be far away.
+        """
+        n = problem.n_states
+        ranges = problem.upper - problem.lower
+        steep = 100.0 * problem.penalty_linear / problem.penalty_quadratic
+        ranges[:n] = np.minimum(ranges[:n], steep)
+        try:
+            sizes = _cost_sizes(problem, ranges)
+        except ModelError:  # a size of the cost is wanted here, not its multipliers
+            sizes = {}
+        level = next(iter(sizes.values()), 1.0)
+        both = 2.0 ** np.rint(np.log2(np.clip(ranges, 1e-50, 1e50)))
+        cost = 4.0 ** np.rint(np.log2(np.clip(level, 1e-100, 1e100)) / 2)
+        return cls(both[:n], both[n:], float(cost), ranges, level)
+
+    @property
+    def both(self) -> Vector:
+        """Scale of (x, u), (n+m,)."""
+        return np.concatenate([self.state, self.action])
+
+    @property
+    def state_price(self) -> Vector:
+        """Scale of multipliers of the states, cost/state, (n,)."""
+        return np.asarray(self.cost / self.state)
+
+    @property
+    def action_price(self) -> Vector:
+        """Scale of multipliers of the actions, cost/action, (m,)."""
+        return np.asarray(self.cost / self.action)
+
+
+def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
+    """Sizes of the cost over steps `both` (n+m,) of (x, u), those that are not rounding, by name.
+
+    They are `dearest`, the largest multiplier of a state bound at the reference, `curved`, the
+    largest curvature, and `cost` itself; multipliers and curvatures of the economic cost. Raises
+    ModelError where the multipliers cannot be computed.
+    """
+    model, n, reference = problem.model, problem.n_states, problem.reference
+    x, u, d, p = model.symbols()
+    w = ca.vertcat(x, u)
+    hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
+    rates = ca.jacobian(model.ode(x, u, d, p), w)
+    function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
+    nominal = (model.nominal_disturbance, model.nominal_parameters)
+    values = function(reference[:n], reference[n:], *nominal)
+    gradient, curvature = (value.full().reshape(-1) for value in values[:2])
+    rates = values[2].full()
+    near = ACTIVE * (problem.upper - problem.lower)
+    below, above = reference <= problem.lower + near, reference >= problem.upper - near
+    found = multipliers(gradient * both, rates * both, below, above)
+    sizes = {
+        "dearest": float(found[:n].max()),
+        "curved": float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max()),
+        "cost": abs(problem.reference_cost),
+    }
+    # A size below rounding counts as zero.
+    least = np.finfo(np.float64).eps ** 0.5 * max(sizes.values())
+    return {name: size for name, size in sizes.items() if size > least}
 
 
 def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
@@ -274,6 +339,11 @@ class Problem:
     def integration(self) -> Integration:
         """How accurate the prediction of a sample is, measured on first use."""
         return measure_integration(self)
+
+    @cached_property
+    def scale(self) -> Scale:
+        """What the controller's QP is scaled by."""
+        return Scale.of(self)
 
     def value_level(self, discount: float | None = None) -> float:
         """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.

@@ -66,39 +66,35 @@ class QpSolution(NamedTuple):
     def residual(self, qp: SoftQp) -> float:
         """Distance from optimality, zero exactly at the primal-dual solution.
 
-        The largest of ‖Hv + f + ν + Γᵀλ‖∞ / max(1, ‖f‖∞, ‖Hv‖∞, ‖Γᵀλ‖∞), ‖v − clip(v + ν)‖∞ and
-        ‖y − prox_φ(y + λ)‖∞, with y = Γv and φ the soft bound: the latter two measure feasibility,
-        sign and complementarity at once.
+        With σ_j the largest of |f|_j, |Hv|_j, |Γᵀλ|_j, |ν_j| and H_jj, the largest of
+        |Hv + f + ν + Γᵀλ|_j / σ_j, |v − clip(v + ν/σ)|_j and |y − prox(y + λ/w)|_i / (1 + |y_i|),
+        with y = Γv and the soft bound Σ t + (W/w) t²: the latter two measure feasibility, sign and
+        complementarity at once. A change of the cost's unit does not change it.
         """
         v, nu, lam = self
         curvature, pull, y = qp.H @ v, lam @ qp.rows, qp.rows @ v
-        parts = np.array(
-            [
-                curvature + qp.f + nu + pull,
-                v - np.minimum(np.maximum(v + nu, qp.lower), qp.upper),
-                qp.f,
-                curvature,
-                pull,
-            ]
-        )
-        sizes = np.abs(parts).max(axis=1).tolist()
-        stationarity, bounds = sizes[0] / max(1.0, *sizes[2:]), sizes[1]
-        # prox_φ(y + λ) of φ(y) = Σ w t + W t², t the violation of the row limits.
-        nearest = np.minimum(np.maximum(y + lam, qp.row_lower), qp.row_upper)
-        beyond = y + lam - nearest
-        shrunk = np.maximum(np.abs(beyond) - qp.w, 0.0) / (1 + 2 * qp.W)
-        rows = float(np.abs(y - (nearest + np.copysign(shrunk, beyond))).max())
-        return float(max(stationarity, bounds, rows))
+        terms = np.abs(np.array([qp.f, curvature, pull, nu, qp.H.diagonal()]))
+        sizes = np.maximum(terms.max(axis=0), 1e-30)
+        stationarity = np.abs(curvature + qp.f + nu + pull) / sizes
+        bounds = np.abs(v - np.minimum(np.maximum(v + nu / sizes, qp.lower), qp.upper))
+        moved = y + lam / qp.w
+        nearest = np.minimum(np.maximum(moved, qp.row_lower), qp.row_upper)
+        beyond = moved - nearest
+        shrunk = np.maximum(np.abs(beyond) - 1.0, 0.0) / (1 + 2 * qp.W / qp.w)
+        rows = np.abs(y - (nearest + np.copysign(shrunk, beyond))) / (1 + np.abs(y))
+        return float(max(stationarity.max(), bounds.max(), rows.max(initial=0.0)))
 
-    def weakly_active(self, qp: SoftQp, tolerance: float = 1e-6) -> bool:
+    def weakly_active(self, qp: SoftQp, tolerance: float = 2e-8) -> bool:
         """Whether some bound or row is about to change its activity.
 
         A limit is reached within `tolerance`, relative to 1 + |limit|. It is about to change if its
-        multiplier is below `tolerance`·max(1, ‖multipliers‖∞), a row's also if that is as close to
-        w, or if no free variable moves the row. Derivatives of the solution are then one-sided.
+        multiplier is below `tolerance`·max(‖diag H‖∞, ‖multipliers‖∞), a row's also if that is as
+        close to w, or if no free variable moves the row. Derivatives of the solution are then
+        one-sided.
         """
         v, nu, lam = self
-        small = tolerance * max(1.0, float(np.abs(nu).max()))
+        curvature = float(qp.H.diagonal().max())
+        small = tolerance * max(curvature, float(np.abs(nu).max()))
         free = qp.lower != qp.upper
         at_bound = np.minimum(v - qp.lower, qp.upper - v) < tolerance * (1 + np.abs(v))
         if (free & at_bound & (np.abs(nu) < small)).any():
@@ -108,7 +104,7 @@ class QpSolution(NamedTuple):
             1 + np.abs(y)
         )
         size = np.abs(lam)
-        undecided = (size < tolerance * np.maximum(1.0, size.max())) | (
+        undecided = (size < tolerance * np.maximum(curvature, size.max(initial=0.0))) | (
             np.abs(size - qp.w) < tolerance * qp.w
         )
         moved = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0) > 0
@@ -117,14 +113,16 @@ class QpSolution(NamedTuple):
     def active(self, qp: SoftQp) -> tuple[Mask, Mask, Mask]:
         """Masks: variables held by a bound, rows held at a limit, rows violated.
 
-        They are the branches of the proximal operators in `residual`: of a distance and its
-        multiplier the larger decides, which is unsafe where `weakly_active`.
+        They are the branches of proximal operators as in `residual`: of a distance and its
+        multiplier, relative to the curvature H_jj or to w, the larger decides, which is unsafe
+        where `weakly_active`.
         """
         v, nu, lam = self
-        held = (qp.lower == qp.upper) | (np.minimum(v - qp.lower, qp.upper - v) < np.abs(nu))
-        y, size = qp.rows @ v, np.abs(lam)
+        push = np.abs(nu) / np.maximum(np.abs(qp.H.diagonal()), 1e-30)
+        held = (qp.lower == qp.upper) | (np.minimum(v - qp.lower, qp.upper - v) < push)
+        y, size = qp.rows @ v, np.abs(lam) / qp.w
         outside = np.maximum(qp.row_lower - y, y - qp.row_upper)
-        violated = size + outside > qp.w
+        violated = size + outside > 1
         return held, ~violated & (size + outside > 0), violated
 
     def licq_margin(self, qp: SoftQp) -> float:
@@ -216,7 +214,7 @@ def kkt_solve(
     return v, lam
 
 
-def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-10) -> QpSolution:
+def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-12) -> QpSolution:
     """Bring an approximate solution to a residual below `accuracy` by a few Newton steps.
 
     Each step solves exactly for the iterate's active set (a primal-dual active-set method, that is
@@ -355,6 +353,9 @@ class DaqpBackend:
         return QpSolution(v, multipliers[:n], multipliers[n:])
 
 
+ENOUGH = 1e-9
+"""Residual of a polished solution that is one."""
+
 # Options of each attempt. ProxQP 0.8.0 takes some feasible QPs for infeasible, others with and
 # without the switch.
 ATTEMPTS: dict[str, list[dict[str, Any]]] = {
@@ -404,32 +405,41 @@ class QpsolversBackend:
             except qpsolvers.QPError as error:
                 reason = str(error)
                 continue
-            if found.found:
-                z, box = np.asarray(found.z), np.asarray(found.z_box).copy()
-                box[fixed] = np.asarray(found.y)
-                v = np.asarray(found.x)[: qp.f.size]
-                return polish(qp, QpSolution(v, box[: v.size], z[rows:] - z[:rows]))
+            if found.x is None or not np.isfinite(found.x).all():
+                continue
+            z, box = np.asarray(found.z), np.asarray(found.z_box).copy()
+            box[fixed] = np.asarray(found.y)
+            v = np.asarray(found.x)[: qp.f.size]
+            solution = polish(qp, QpSolution(v, box[: v.size], z[rows:] - z[:rows]))
+            # A solver may say that it failed where it is near: what it says is not looked at.
+            if solution.residual(qp) < ENOUGH:
+                return solution
         raise QpError(
             f"{self._solver} did not solve the QP: {reason}", status="not solved", qp=qp.copy()
         )
 
 
 def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
-    """The QP in (v, t) as qpsolvers has it: the slack is a variable, fixed variables are equations.
+    """The QP in (v, τ) as qpsolvers has it: the slack is a variable, fixed variables are equations.
 
-    min_(v,t)  ½ vᵀH v + fᵀv + wᵀt + tᵀ diag(W) t
-    s.t.       Γ v + t ≥ row_lower,   Γ v − t ≤ row_upper,   lower ≤ v ≤ upper,   t ≥ 0
+    min_(v,τ)  ½ vᵀH v + fᵀv + wᵀt + tᵀ diag(W) t
+    s.t.       Γ v + t ≥ row_lower,   Γ v − t ≤ row_upper,   lower ≤ v ≤ upper,   τ ≥ 0
+
+    with the slack t_i = τ_i h/w_i in units of such a size, h = max_j H_jj, that its price is h: ProxQP
+    takes QPs for infeasible whose prices are many times their curvature.
     """
     import qpsolvers  # noqa: PLC0415
     import scipy.sparse as sp  # noqa: PLC0415
 
     n, rows = qp.f.size, qp.w.size
-    fixed, free, unit = qp.lower == qp.upper, np.full(rows, np.inf), np.eye(rows)
+    fixed, free = qp.lower == qp.upper, np.full(rows, np.inf)
+    slack = qp.H.diagonal().max() / qp.w
+    unit = np.diag(slack)
     P = np.zeros((n + rows, n + rows))
-    P[:n, :n], P[n:, n:] = qp.H, np.diag(2 * qp.W)
+    P[:n, :n], P[n:, n:] = qp.H, np.diag(2 * qp.W * slack**2)
     G, h = np.block([[-qp.rows, -unit], [qp.rows, -unit]]), np.r_[-qp.row_lower, qp.row_upper]
     A, b = np.eye(n, n + rows)[fixed], qp.lower[fixed]
     lower = np.r_[np.where(fixed, -np.inf, qp.lower), np.zeros(rows)]
     upper = np.r_[np.where(fixed, np.inf, qp.upper), free]
     P, G, A = (each if dense else sp.csc_matrix(each) for each in (P, G, A))
-    return qpsolvers.Problem(P, np.r_[qp.f, qp.w], G, h, A, b, lower, upper)
+    return qpsolvers.Problem(P, np.r_[qp.f, qp.w * slack], G, h, A, b, lower, upper)

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from controllers.functions import StackedFunction
-from controllers.problem import Problem
+from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.rti.preparation import stage_parameter_gradient
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
@@ -63,9 +63,13 @@ def sensitivities(
     QP's A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam (nN, m). Its
     results are `policy` (n_θ, m), dπ/dθ transposed, and `state` (n, m), dπ/ds transposed. With
     `exact` both need M (see `_theta_part`) and χ̄, the costates where the curvature was taken, the
-    second also dM, the directional derivative of M.
+    second also dM, the directional derivative of M. v, lam, the QP's matrices and the directions
+    are in units of `Problem.scale`, all else in the model's.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+    scale = problem.scale
+    state, action = ca.DM(scale.state), ca.DM(scale.action)
+    price = ca.DM(scale.state_price)
     symbols = symbolic_theta(problem, blocks)
     columns = {"xi": horizon + 1, "v": horizon, "t": horizon, "lam": horizon, "chi": horizon + 1}
     y = {name: ca.SX.sym(name, m if name == "v" else n, c) for name, c in columns.items()}
@@ -73,6 +77,11 @@ def sensitivities(
     M = ca.SX.sym("M", n + m, horizon * (n + m))
     guess = ca.SX.sym("guess", n, horizon)
     extra = {"M": M, "guess": guess} if exact else {}
+    scaled = {name: ca.SX.sym(name, *y[name].shape) for name in ("v", "lam")}
+    in_model_units = [
+        scaled["v"] * ca.repmat(action, 1, horizon),
+        scaled["lam"] * ca.repmat(price, 1, horizon),
+    ]
     part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
     gradient = ca.gradient(part, symbols["theta"])
     if "p" in blocks:
@@ -83,9 +92,14 @@ def sensitivities(
             curved = [M[:, k * (n + m) : (k + 1) * (n + m)], guess[:, k]] if exact else []
             total += of_stage(x[:, k], u[:, k], symbols["theta"], w, y["chi"][:, k + 1], *curved)
         gradient[blocks.slices["p"]] = total
-    solution = {name: y[name] for name in SOLUTION}
+    solution = {name: y[name] for name in SOLUTION} | scaled
     inputs = {**solution, "x": x, "u": u, "theta": symbols["theta"], **extra}
-    value = StackedFunction("value_gradient", inputs, {"gradient": gradient})
+
+    def of_scaled(expression: ca.SX) -> ca.SX:
+        """The expression of v and lam in the model's units as one of the scaled ones."""
+        return ca.substitute([expression], [y["v"], y["lam"]], in_model_units)[0]
+
+    value = StackedFunction("value_gradient", inputs, {"gradient": of_scaled(gradient)})
 
     @cache
     def policy_jacobian() -> StackedFunction:
@@ -96,7 +110,7 @@ def sensitivities(
         )
         dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
         symbol = ca.veccat(*y.values(), *([M] if exact else []))
-        policy, state = [], []
+        policy, by_state = [], []
         for i in range(m):
             v_i = ca.reshape(dv[:, i], m, horizon)
             lam_i = ca.reshape(dlam[:, i], n, horizon)
@@ -111,15 +125,24 @@ def sensitivities(
                 costate = weight[:n, :] @ ca.vertcat(xi_i[k], v_i[:, k])
                 costate += A[:, k * n : (k + 1) * n] @ chi_i[0]
                 chi_i.insert(0, costate + (lam_i[:, k - 1] if k else 0))
+            # In the model's units: the right-hand side was one unit of the scaled action's price.
+            unit = float(scale.action[i] / scale.cost)
             curved = [dM[:, i]] if exact else []
-            direction = ca.veccat(*xi_i, v_i, dt[:, i], lam_i, *chi_i, *curved)
-            policy.append(-ca.jtimes(gradient, symbol, direction))
-            state.append(-chi_i[0])
+            direction = ca.veccat(
+                *(part * state * unit for part in xi_i),
+                v_i * ca.repmat(action * unit, 1, horizon),
+                ca.reshape(dt[:, i], n, horizon) * ca.repmat(state * unit, 1, horizon),
+                lam_i * ca.repmat(price * unit, 1, horizon),
+                *(part * price * unit for part in chi_i),
+                *curved,
+            )
+            policy.append(-of_scaled(ca.jtimes(gradient, symbol, direction)))
+            by_state.append(-chi_i[0] * price * unit)
         moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
         return StackedFunction(
             "policy_jacobian",
             {**inputs, **moved, **({"dM": dM} if exact else {})},
-            {"policy": ca.horzcat(*policy), "state": ca.horzcat(*state)},
+            {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)},
         )
 
     return value, policy_jacobian
@@ -144,20 +167,25 @@ def adjoint_directions(
 
 
 def curvature_directions(
-    rows: Matrix, dv: Matrix, step: Matrix, contract: Callable[[Matrix], Matrix]
+    rows: Matrix,
+    dv: Matrix,
+    step: Matrix,
+    contract: Callable[[Matrix], Matrix],
+    scale: Scale,
 ) -> Matrix:
     """Directional derivatives of M along the adjoint directions, (m, N(n+m)²).
 
-    `rows` are those of the QP, `step` (N, n+m) is Δw of each stage, `contract` the Hessian's
-    spectrum's.
+    `rows` are those of the QP, `step` (N, n+m) is Δw of each stage in the model's units, `contract`
+    the Hessian's spectrum's, `scale` that of the QP.
     """
     horizon, width = step.shape
     n = rows.shape[0] // horizon
     result = []
-    for row in dv:
+    for unit, row in zip(scale.action / scale.cost, dv, strict=True):
         moved = np.zeros((horizon, width))
         moved[1:, :n] = (rows @ row).reshape(horizon, n)[:-1]
         moved[:, n:] = row.reshape(horizon, width - n)
+        moved *= scale.both * unit
         seed = (step[:, :, None] * moved[:, None, :] + moved[:, :, None] * step[:, None, :]) / 2
         result.append(contract(seed).reshape(-1))
     return np.array(result)

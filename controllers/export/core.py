@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from controllers.errors import ControllerError
 from controllers.functions import c_source, not_in_c, work_sizes
 from controllers.problem import Problem
-from controllers.rti.preparation import Exact, SampleFunctions
+from controllers.rti.preparation import RESIDUAL, Exact, SampleFunctions
 from controllers.theta import Parameters
 from cosim.scenario import Scenario
 
@@ -134,6 +134,16 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         vectors += ["penalty_linear", "penalty_quadratic"]
         slack = {kind: f"((void)(theta), PENALTY_{kind.upper()})" for kind in slack}
     arrays = {name.upper(): getattr(problem, name) for name in vectors}
+    scale, rule = problem.scale, made.hessian
+    arrays |= {
+        "SCALE_STATE": scale.state,
+        "SCALE_ACTION": scale.action,
+        "STATE_PRICE": scale.state_price,
+        "BEND": rule.bend.reshape(-1),
+        "SLOPE": rule.slope,
+    }
+    if isinstance(rule, Exact):
+        arrays["METRIC"] = rule.metric.reshape(-1)
     arrays["DISCOUNTS"] = problem.discounts[:-1]
     arrays["SLACK_DISCOUNTS"] = problem.discounts[1:]
     return _filled(
@@ -142,6 +152,8 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         arrays="\n".join(_array(name, values) for name, values in arrays.items()),
         end_discount=repr(float(problem.discounts[-1])),
         floor=repr(Exact.FLOOR),
+        residual=repr(RESIDUAL),
+        cost_scale=repr(problem.scale.cost),
         rule=made.hessian.source,
         solver=SOLVERS[stagewise][0],
         stagewise=str(int(stagewise)),

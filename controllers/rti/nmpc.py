@@ -24,8 +24,15 @@ from controllers.export.core import (
 )
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
-from controllers.qp import QpBackend, QpSolution, SoftQp, make_backend, multipliers_at_kink
-from controllers.rti.preparation import Exact, SampleFunctions, Spectrum
+from controllers.qp import (
+    QpBackend,
+    QpSolution,
+    SoftQp,
+    make_backend,
+    multipliers_at_kink,
+    polish,
+)
+from controllers.rti.preparation import RESIDUAL, Exact, SampleFunctions, Spectrum
 from controllers.sensitivities import (
     SOLUTION,
     adjoint_directions,
@@ -131,12 +138,12 @@ class RtiSolution:
 
     @cached_property
     def multipliers(self) -> QpSolution:
-        """Primal-dual solution of the condensed QP."""
+        """Primal-dual solution of the condensed QP, in units of `Problem.scale`."""
         return QpSolution(*(self._part(name) for name in ("v", "nu", "lam")))
 
     @cached_property
     def qp(self) -> SoftQp:
-        """The condensed QP that was solved."""
+        """The condensed QP that was solved, in units of `Problem.scale`."""
         functions, prepared = self.prepared.functions, self.prepared
         if prepared.engine is not None and prepared.engine.stagewise:
             functions.condense(prepared.memory, self.memory)
@@ -150,8 +157,9 @@ class RtiSolution:
     @cached_property
     def predicted_actions(self) -> Matrix:
         """Predicted actions u_0 … u_{N−1}, shape (N, m)."""
-        reference = self.prepared.functions.problem.reference_action
-        return np.asarray(self.multipliers.v.reshape(-1, reference.size) + reference)
+        problem = self.prepared.functions.problem
+        moved = self.multipliers.v.reshape(-1, problem.n_actions) * problem.scale.action
+        return np.asarray(moved + problem.reference_action)
 
     @property
     def unshifted(self) -> LinearisationPoint:
@@ -179,14 +187,13 @@ class RtiSolution:
         """dQ/da, shape (m,): zero where the action was not enforced."""
         if not self.enforced:
             return np.zeros(self.action.size)
-        return np.asarray(-self.multipliers.nu[: self.action.size])
+        price = self.prepared.functions.problem.scale.action_price
+        return np.asarray(-self.multipliers.nu[: self.action.size] * price)
 
-    @cached_property
+    @property
     def residual(self) -> float:
-        """Largest KKT residual; compiled code has measured it when it solved."""
-        if self.prepared.engine is not None and not self.enforced:
-            return float(self._part("residual")[0])
-        return self.multipliers.residual(self.qp)
+        """Largest KKT residual, without a unit: see `readout`. `solved` was said after a look."""
+        return float(self._part("residual")[0])
 
     @property
     def iterations(self) -> int | None:
@@ -248,7 +255,8 @@ class RtiSolution:
             inputs[name][:] = direction.reshape(-1)
         if "dM" in inputs:
             step = self._step_from_point()
-            moved = curvature_directions(self.qp.rows, dv, step, prepared.contract)
+            scale = prepared.functions.problem.scale
+            moved = curvature_directions(self.qp.rows, dv, step, prepared.contract, scale)
             inputs["dM"][:] = moved.reshape(-1)
         function()
         by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))
@@ -275,6 +283,10 @@ class RtiSolution:
 
 
 NOT_FINITE = STATUSES.index("not finite")
+INACCURATE = "inaccurate"
+"""Status of the QpError of a QP whose solution is not accurate enough to be used."""
+ACCURATE = 1e-9
+"""KKT residual above which a solution is polished."""
 
 
 class Engine:
@@ -319,6 +331,34 @@ class Engine:
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)
         return None if path is None else cls(str(path), functions, stagewise)
+
+    def agrees(self, functions: Functions) -> bool:
+        """Whether the compiled functions give what CasADi's interpreter gives, at one state.
+
+        Compilers have faults: gcc 12 has been seen to drop the results of a model's linearisation.
+        The state is the reference, at the point and θ of the memory, which stays as it is.
+        """
+        prepared, read = functions.preparation, functions.readout
+        kept = prepared.memory.copy(), read.memory.copy()
+        gradient = functions.derivatives[0]
+        read.inputs["s"][:] = functions.problem.reference_state
+        same = True
+        if self.prepare() == 0:
+            linear = slice(prepared.places["A"].start, prepared.places["r"].stop)
+            compiled = prepared.memory[linear].copy()
+            prepared()
+            same = _alike(compiled, prepared.memory[linear])
+        if same and self.prepare() == 0 and self.feedback(False) == 0:
+            compiled = read.stack.copy()
+            read()
+            same = _alike(compiled, read.stack)
+            for name in gradient.inputs:
+                source = read if name in read.places else prepared
+                gradient.inputs[name][:] = source.memory[source.places[name]]
+            gradient()
+            same = same and _alike(read.memory[read.places["gradient"]], gradient.stack)
+        prepared.memory[:], read.memory[:] = kept
+        return same
 
     def prepare(self) -> int:
         """Preparation phase at the point and θ that the memory holds."""
@@ -421,10 +461,7 @@ class RtiNmpc:
         self._readout, self._hessian = made.readout, made.hessian
         before, after = self._prepare.memory, self._readout.memory
         self._qp = made.qp(before, after)
-        self._bounds = (
-            problem.action_lower - problem.reference_action,
-            problem.action_upper - problem.reference_action,
-        )
+        self._bounds = self._scaled(problem.action_lower), self._scaled(problem.action_upper)
         self._qp.lower[:], self._qp.upper[:] = np.tile(self._bounds, horizon)
         self._engine: Engine | None = None
         self._prepared: Prepared | None = None
@@ -461,7 +498,15 @@ class RtiNmpc:
             self._compilable = False
             warn(f"{reason}: the controller is not compiled, which is slower", ModelWarning)
             return
-        self._engine = Engine.compile(self._functions)
+        engine = Engine.compile(self._functions)
+        if engine is not None and not engine.agrees(self._functions):
+            warn(
+                "the C compiler makes other numbers of the model than CasADi does: the controller "
+                "is not compiled, which is slower; set CC to another compiler",
+                ModelWarning,
+            )
+            engine = None
+        self._engine = engine
         self.functions = INTERPRETED if self._engine is None else COMPILED
         self._compilable = self._engine is not None  # where it failed once it is not tried again
         self._prepared = None
@@ -555,8 +600,14 @@ class RtiNmpc:
         discounts = np.repeat(self.problem.discounts[1:], n)
         # Make new views: a backend recognises new weights by them.
         self._qp.w, self._qp.W = self._prepare.part("w"), self._prepare.part("W")
-        self._qp.w[:] = discounts * np.tile(w, horizon)
-        self._qp.W[:] = discounts * np.tile(W, horizon)
+        price = self.problem.scale.state_price
+        self._qp.w[:] = discounts * np.tile(w / price, horizon)
+        self._qp.W[:] = discounts * np.tile(W * (self.problem.scale.state / price), horizon)
+
+    def _scaled(self, action: Vector) -> Vector:
+        """The QP's variables that stand for an action (m,)."""
+        problem = self.problem
+        return np.asarray((action - problem.reference_action) / problem.scale.action)
 
     def _linearise(self) -> None:
         prepare = self._prepare
@@ -647,7 +698,7 @@ class RtiNmpc:
             raise self._failure(message, "state or action not finite")
         memory = self._readout.memory.copy()
         return RtiSolution(
-            action=memory[self._controls] + problem.reference_action,
+            action=memory[self._controls] * problem.scale.action + problem.reference_action,
             value=float(memory[self._value]),
             prepared=prepared,
             memory=memory,
@@ -670,18 +721,32 @@ class RtiNmpc:
         self._embed()
         qp.lower[:m], qp.upper[:m] = self._bounds
         if a is not None:
-            qp.lower[:m] = qp.upper[:m] = a - self.problem.reference_action
+            qp.lower[:m] = qp.upper[:m] = self._scaled(a)
         if not self._embed.finite() or not (a is None or all(map(isfinite, a.tolist()))):
             return False
+        read.inputs["constant"][0] = self._constant[0]
         found = self._backend.solve(qp)
-        if a is not None:
-            found = multipliers_at_kink(qp, found, *self._bounds)
-        inputs = read.inputs
-        inputs["constant"][0] = self._constant[0]
-        inputs["v"][:], inputs["lam"][:] = found.v, found.lam
-        read.memory[read.places["nu"]] = found.nu
-        read()
+        residual = self._read(found, a is not None)
+        if not residual <= ACCURATE:
+            residual = self._read(polish(qp, found), a is not None)
+        if not residual <= RESIDUAL:
+            raise QpError(
+                f"the QP was solved too inaccurately: its KKT residual is {residual:.1e}, more "
+                f"than {RESIDUAL:g}; is the model unstable over so long a horizon?",
+                status=INACCURATE,
+                qp=qp.copy(),
+            )
         return True
+
+    def _read(self, found: QpSolution, enforced: bool) -> float:
+        """Read a solution of the QP out; its residual."""
+        if enforced:
+            found = multipliers_at_kink(self._qp, found, *self._bounds)
+        read = self._readout
+        for name, values in found._asdict().items():
+            read.inputs[name][:] = values
+        read()
+        return float(read.part("residual")[0])
 
     def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:
         """A new closed loop in compiled code; None if only Python can run it.
@@ -777,6 +842,12 @@ def compile_functions(controller: object, samples: int = LONG) -> None:
     """Compile the controller if it is an `RtiNmpc`; do nothing for others."""
     if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
         controller.compile(samples)
+
+
+def _alike(one: Vector, other: Vector) -> bool:
+    """Whether two vectors are equal but for rounding, relative to the largest entry."""
+    size = float(np.abs(other).max(initial=0.0))
+    return bool(np.allclose(one, other, rtol=0.0, atol=1e-9 * size, equal_nan=True))
 
 
 def _rows(kind: str, values: ArrayLike, count: int, shape: tuple[int, ...]) -> Vector:

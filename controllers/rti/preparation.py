@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +19,11 @@ from controllers.qp import SoftQp
 from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
 from cosim.protocols import Vector
 from cosim.validation import instead
+
+RESIDUAL = 1e-8
+"""Largest KKT residual of a QP that counts as solved."""
+TINY = 1e-30
+"""What a size is at least, so that it can divide."""
 
 
 def sampled_jacobian(
@@ -52,17 +57,18 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     """One stage's A_k, B_k and r_k of ξ₊ = A_k ξ + B_k v + r_k, as a function of (x, u, theta).
 
     x (n) and u (m) are in absolute units; the results are A_kᵀ (n, n), B_kᵀ (m, n) and r_k (n),
-    which holds the model offset c_f too.
+    which holds the model offset c_f too, for ξ and v in units of `Problem.scale`.
     """
-    n = problem.n_states
+    n, scale = problem.n_states, problem.scale
     x, u, symbols = _point(problem, blocks)
     x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
     x_next, jacobian = sampled_jacobian(problem, x, u, symbols["model_parameters"])
     a, b = jacobian[:, :n], jacobian[:, n:]
     offset = x_next - x_s - a @ (x - x_s) - b @ (u - u_s) + symbols["c_f"]
-    return stage_function(
-        "linearise", {"x": x, "u": u, "theta": symbols["theta"]}, {"A": a.T, "B": b.T, "r": offset}
-    )
+    by_state = ca.DM(np.outer(1 / scale.state, scale.state))
+    by_action = ca.DM(np.outer(1 / scale.state, scale.action))
+    scaled = {"A": (a * by_state).T, "B": (b * by_action).T, "r": offset / ca.DM(scale.state)}
+    return stage_function("linearise", {"x": x, "u": u, "theta": symbols["theta"]}, scaled)
 
 
 def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> ca.Function:
@@ -117,6 +123,7 @@ def _curvature(problem: Problem, symbols: Symbols, x: ca.SX, u: ca.SX, chi: ca.S
 def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     """Linearise and condense: all of the QP that does not depend on the state s.
 
+    All of the QP is in units of `Problem.scale`: states ξ, actions v and costs.
     With V = (v_0, …, v_{N−1}) the predicted states are Ξ = Γ V + Φ ξ_0 + g, and the cost is
     ½VᵀHV + (f + F ξ_0)ᵀV + const. for stage costs ½wᵀL_k w + q_kᵀw and terminal ½ξᵀL_N ξ + q_Nᵀξ.
 
@@ -243,25 +250,26 @@ def embedding(
 
     Inputs: s, read from the read-out's memory; theta and the rest from the preparation's. Results,
     written to the read-out's memory: the gradient f, and the lower and upper limits that the soft
-    rows Γ V must respect.
+    rows Γ V must respect. s and theta are in the model's units, the QP in `Problem.scale`'s.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = symbolic_theta(problem, blocks)
     s = ca.SX.sym("s", n)
-    x_s = ca.DM(problem.reference_state)
+    x_s, state = ca.DM(problem.reference_state), ca.DM(problem.scale.state)
+    xi = (s - x_s) / state
     prior = {
         "Phi": ca.SX.sym("Phi", n, horizon * n),
         "g": ca.SX.sym("g", horizon * n),
         "f": ca.SX.sym("f", horizon * m),
         "F": ca.SX.sym("F", n, horizon * m),
     }
-    free = prior["Phi"].T @ (s - x_s) + prior["g"]
-    lower = ca.repmat(symbols["x_l"] - x_s, horizon, 1) - free
-    upper = ca.repmat(symbols["x_u"] - x_s, horizon, 1) - free
+    free = prior["Phi"].T @ xi + prior["g"]
+    lower = ca.repmat((symbols["x_l"] - x_s) / state, horizon, 1) - free
+    upper = ca.repmat((symbols["x_u"] - x_s) / state, horizon, 1) - free
     return StackedFunction(
         "embedding",
         {"s": s, "theta": symbols["theta"], **prior},
-        {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
+        {"f": prior["f"] + prior["F"].T @ xi, "lower": lower, "upper": upper},
         {name: prepared.part(name) for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
@@ -269,24 +277,33 @@ def embedding(
 
 
 def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
-    """States, slack, costates and value that belong to a solution (v, λ) of the condensed QP.
+    """States, slack, costates, value and residual that belong to a solution of the condensed QP.
 
-    Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta and the QP's
-    A, B, r, L, q, L_N, q_N are read from the preparation's memory. Results: xi (n, N+1),
-    t (n, N), chi (n, N+1), value. The costates χ solve the adjoint recursion, so χ_0 is the
+    Inputs: s (n); the primal-dual solution v (m, N), lam (n, N), nu (m, N) with the limits `lower`
+    and `upper` (m, N) of v; the constant of the QP's stage costs; theta and the QP's A, B, r, L, q,
+    L_N, q_N are read from the preparation's memory. Results: xi (n, N+1), t (n, N), chi (n, N+1),
+    value; `residual`, see `_residual`. The costates χ solve the adjoint recursion, so χ_0 is the
     gradient of the value in s. The solution shifted by one stage is the next point of
     linearisation: next_x (n, N), next_u (m, N) in absolute units, next_chi (n, N), the costates of
     stages that weigh 1/γ as much. Behind them its memory has room for the rest of a solution: what
-    `embedding` gives, multipliers nu of the controls' limits `lower` and `upper` (Nm,), and what
-    compiled code gives, `residual` and `iterations` of the QP's solver and the gradient (n_θ,).
+    `embedding` gives, and what compiled code gives, `iterations` of the QP's solver and the
+    gradient (n_θ,).
+
+    The QP and its solution are in units of `Problem.scale`, the results in the model's.
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
+    scale = problem.scale
+    state, action = ca.DM(scale.state), ca.DM(scale.action)
+    price = ca.DM(scale.state_price)
     symbols = symbolic_theta(problem, blocks)
     x_s = ca.DM(problem.reference_state)
     shapes = {
         "s": (n, 1),
         "v": (m, horizon),
         "lam": (n, horizon),
+        "nu": (m, horizon),
+        "lower": (m, horizon),
+        "upper": (m, horizon),
         "A": (n, n * horizon),
         "B": (m, n * horizon),
         "r": (n, horizon),
@@ -297,24 +314,28 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
         "constant": (1, 1),
     }
     given = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
-    s, v, lam, A, B, r, L, q, L_N, q_N, constant = given.values()
+    v, lam, A, B = (given[name] for name in ("v", "lam", "A", "B"))
+    L, q, L_N, q_N = (given[name] for name in ("L", "q", "L_N", "q_N"))
+    lower, upper = ((symbols[name] - x_s) / state for name in ("x_l", "x_u"))
+    w_sigma, W_sigma = symbols["w_sigma"] / price, symbols["W_sigma"] * (state / price)
 
+    s = given["s"]
     known = problem.symbolic_penalty(s)
-    xi = [s - x_s]
-    value = constant + known + symbols["c_lambda"]
-    value += ca.bilin(symbols["B_lambda"], xi[0]) + ca.dot(symbols["b_lambda"], xi[0])
-    t, weights = [], []
+    away = s - x_s
+    value = given["constant"] + known + symbols["c_lambda"]
+    value += ca.bilin(symbols["B_lambda"], away) + ca.dot(symbols["b_lambda"], away)
+    value /= scale.cost
+    xi, t, weights = [away / state], [], []
     for k in range(horizon):
         w = ca.vertcat(xi[k], v[:, k])
         weights.append(L[:, k * (n + m) : (k + 1) * (n + m)])
         value += ca.bilin(weights[k], w) / 2 + ca.dot(q[:, k], w)
         columns = slice(k * n, (k + 1) * n)
-        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ v[:, k] + r[:, k])
-        outside = ca.fmax(symbols["x_l"] - x_s - xi[k + 1], xi[k + 1] - symbols["x_u"] + x_s)
+        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ v[:, k] + given["r"][:, k])
+        above = xi[k + 1] - symbols["x_u"] / state + x_s / state
+        outside = ca.fmax(lower - xi[k + 1], above)
         t.append(ca.fmax(outside, 0))
-        value += gamma ** (k + 1) * (
-            ca.dot(symbols["w_sigma"], t[k]) + ca.dot(symbols["W_sigma"], t[k] ** 2)
-        )
+        value += gamma ** (k + 1) * (ca.dot(w_sigma, t[k]) + ca.dot(W_sigma, t[k] ** 2))
     value += ca.bilin(L_N, xi[horizon]) / 2 + ca.dot(q_N, xi[horizon])
 
     chi = [L_N @ xi[horizon] + q_N + lam[:, horizon - 1]]
@@ -322,38 +343,103 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
         w = ca.vertcat(xi[k], v[:, k])
         costate = weights[k][:n, :] @ w + q[:n, k] + A[:, k * n : (k + 1) * n] @ chi[0]
         if k == 0:
-            costate += 2 * symbols["B_lambda"] @ xi[0] + symbols["b_lambda"]
-            costate += ca.gradient(known, s)
+            costate += (2 * symbols["B_lambda"] @ away + symbols["b_lambda"]) / price
+            costate += ca.gradient(known, s) / price
         else:
             costate += lam[:, k - 1]
         chi.insert(0, costate)
+    limits = (lower, upper, w_sigma, W_sigma)
+    discounts = problem.discounts[1:]
     u_s = ca.DM(problem.reference_action)
+    actions = v * ca.repmat(action, 1, horizon)
+    states = [part * state for part in xi]
+    costates = [part * price for part in chi]
     return StackedFunction(
         "readout",
         {**given, "theta": symbols["theta"]},
         {
-            "xi": ca.horzcat(*xi),
-            "t": ca.horzcat(*t),
-            "chi": ca.horzcat(*chi),
-            "value": value,
-            "next_x": ca.horzcat(*(state + x_s for state in xi[1:])),
-            "next_u": ca.horzcat(v[:, 1:], v[:, -1]) + ca.repmat(u_s, 1, horizon),
-            "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
+            "xi": ca.horzcat(*states),
+            "t": ca.horzcat(*(part * state for part in t)),
+            "chi": ca.horzcat(*costates),
+            "value": value * scale.cost,
+            "next_x": ca.horzcat(*(part + x_s for part in states[1:])),
+            "next_u": ca.horzcat(actions[:, 1:], actions[:, -1]) + ca.repmat(u_s, 1, horizon),
+            "next_chi": ca.horzcat(*(part / gamma for part in costates[2:]), costates[-1]),
+            "residual": _residual(given, xi, chi, limits, discounts),
         },
         {name: prepared.part(name) for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")},
-        room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
+        room={"f": horizon * m}
         | dict.fromkeys(("row_lower", "row_upper"), horizon * n)
-        | {"residual": 1, "iterations": 1, "gradient": blocks.size},
+        | {"iterations": 1, "gradient": blocks.size},
     )
+
+
+def _residual(
+    given: Mapping[str, ca.SX],
+    xi: Sequence[ca.SX],
+    chi: Sequence[ca.SX],
+    limits: Sequence[ca.SX],
+    discounts: Vector,
+) -> ca.SX:
+    """How far a solution is from optimal, without a unit and without what condensing rounds off.
+
+    The states ξ and the costates χ come from v, λ and the stages' own data, so the dynamics hold.
+    What is left of the optimality conditions is, with σ_j the largest of |L w + q|_j, |Bᵀχ|_j,
+    |ν_j| and the curvature of one step, the largest of
+
+        |L w + q + Bᵀχ + ν|_j / σ_j,    |v − clip(v + ν/σ)|_j,    |y − prox(y + λ/w)|_i / (1 + |y_i|)
+
+    with y = ξ_{k+1}. The last is that of the soft bound Σ t + (W/w) t², with its `limits`: lower,
+    upper, w and W (n,), undiscounted; feasibility, sign and complementarity at once. All are zero
+    exactly at the solution.
+    """
+    v, nu, lam, L, B = (given[name] for name in ("v", "nu", "lam", "L", "B"))
+    (m, horizon), n = v.shape, lam.size1()
+    lower, upper, w_sigma, W_sigma = limits
+    parts = []
+    for k in range(horizon):
+        by_action = B[:, k * n : (k + 1) * n]
+        stage = L[:, k * (n + m) : (k + 1) * (n + m)]
+        last = k + 1 == horizon
+        following = given["L_N"] if last else L[:n, (k + 1) * (n + m) : (k + 1) * (n + m) + n]
+        bent = ca.fabs(ca.diag(following))
+        cost = stage[n:, :] @ ca.vertcat(xi[k], v[:, k]) + given["q"][n:, k]
+        pull = by_action @ chi[k + 1]
+        curvature = ca.fabs(ca.diag(stage[n:, n:])) + by_action**2 @ bent
+        sizes = (ca.fabs(pull), ca.fabs(nu[:, k]), curvature)
+        size = ca.fabs(cost)
+        for other in sizes:
+            size = ca.fmax(size, other)
+        size = ca.fmax(size, TINY)
+        parts.append(ca.fabs(cost + pull + nu[:, k]) / size)
+        moved = v[:, k] + nu[:, k] / size
+        clipped = ca.fmin(ca.fmax(moved, given["lower"][:, k]), given["upper"][:, k])
+        parts.append(ca.fabs(v[:, k] - clipped))
+        y, share = xi[k + 1], lam[:, k] / (float(discounts[k]) * w_sigma)
+        nearest = ca.fmin(ca.fmax(y + share, lower), upper)
+        beyond = y + share - nearest
+        shrunk = ca.fmax(ca.fabs(beyond) - 1, 0) / (1 + 2 * W_sigma / w_sigma)
+        soft = nearest + ca.sign(beyond) * shrunk
+        parts.append(ca.fabs(y - soft) / (1 + ca.fabs(y)))
+    every = ca.vertsplit(ca.vertcat(*parts))
+    largest = every[0]
+    for part in every[1:]:
+        largest = ca.fmax(largest, part)
+    return largest
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Eigenvalues (N, s) and eigenvectors (N, s, s) of the blocks before they were lifted."""
+    """Eigenvalues (N, s) and eigenvectors (N, s, s) of the blocks before they were lifted.
+
+    The blocks are those of steps `ranges` (s,) of (x, u), with costs relative to a level: eigenvalues
+    then have no unit, and the lift is the same in every unit. `floor` (N, 1) is theirs.
+    """
 
     values: Vector
     vectors: Vector
     floor: Vector
+    ranges: Vector
 
     def undecided(self, tolerance: float = 1e-6) -> bool:
         """Whether an eigenvalue is so close to the floor that the lift has a kink there."""
@@ -363,9 +449,11 @@ class Spectrum:
     def contract(self, seed: Vector) -> Vector:
         """Adjoint of the derivative of L = P(·): M with ⟨seed, dL⟩ = ⟨M, dX⟩, shapes (N, s, s).
 
-        The derivative of a spectral function is a Schur product with its divided differences in
-        the eigenbasis (Daleckii and Krein).
+        L, X and the seed are in the model's units. The derivative of a spectral function is a
+        Schur product with its divided differences in the eigenbasis (Daleckii and Krein).
         """
+        metric = np.outer(self.ranges, self.ranges)
+        seed = seed / metric
         lifted = np.maximum(self.values, self.floor)
         gap = self.values[:, :, None] - self.values[:, None, :]
         rise = lifted[:, :, None] - lifted[:, None, :]
@@ -373,13 +461,15 @@ class Spectrum:
         same = np.abs(gap) < 1e-12 * np.maximum(1.0, np.abs(self.values).max())
         divided = np.where(same, kept[:, :, None] * kept[:, None, :], rise / np.where(same, 1, gap))
         transposed = self.vectors.transpose(0, 2, 1)
-        return self.vectors @ (divided * (transposed @ seed @ self.vectors)) @ transposed
+        moved = self.vectors @ (divided * (transposed @ seed @ self.vectors)) @ transposed
+        return np.asarray(moved * metric)
 
 
 class GaussNewton:
     """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is.
 
-    It fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation; `functions` are
+    It fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation, in units of
+    `Problem.scale`; `functions` are
     the CasADi functions that it calls, by the prefix of their constants in C, `spectrum` that of
     the last blocks if they were lifted.
     """
@@ -394,16 +484,21 @@ class GaussNewton:
         self.functions: dict[str, StackedFunction] = {}
         self.discounts = problem.discounts[:-1]
         self._end = float(problem.discounts[-1])
+        scale = problem.scale
+        # What scales a cost's second and first derivatives in the model's units.
+        self.bend = np.outer(scale.both, scale.both) / scale.cost
+        self.slope = scale.both / scale.cost
         self.L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
         self.q = prepared.inputs["q"].reshape(horizon, n + m)
         self._L_N, self._q_N = prepared.inputs["L_N"], prepared.inputs["q_N"]
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over a new θ: its costs, which no linearisation point changes here."""
-        self.L[:] = 2 * self.discounts[:, None, None] * parameters["B_l"]
-        self.q[:] = self.discounts[:, None] * parameters["b_l"]
-        self._L_N[:] = 2 * self._end * parameters["B_Vf"].reshape(-1)
-        self._q_N[:] = self._end * parameters["b_Vf"]
+        n = self._q_N.size
+        self.L[:] = 2 * self.discounts[:, None, None] * parameters["B_l"] * self.bend
+        self.q[:] = self.discounts[:, None] * parameters["b_l"] * self.slope
+        self._L_N[:] = (2 * self._end * parameters["B_Vf"] * self.bend[:n, :n]).reshape(-1)
+        self._q_N[:] = self._end * parameters["b_Vf"] * self.slope[:n]
 
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write L and q for the points (N, n), (N, m); return the cost's constant."""
@@ -414,8 +509,9 @@ class Exact(GaussNewton):
     """L_k = P(2γᵏB_l + D_k), D_k the curvature of χ̄_{k+1}ᵀf at the linearisation point.
 
     P lifts the eigenvalues of each stage's block to at least γᵏ·`FLOOR`, so that the QP keeps its
-    stage structure and is strictly convex. The floor does not depend on θ, so that P can be
-    differentiated. The terminal cost has no curvature of the model and stays as it is. Where
+    stage structure and is strictly convex. They are those of the block over the ranges of (x, u)
+    and relative to the level of the cost in `Problem.scale`, so P is the same in every unit. The
+    floor does not depend on θ, so that P can be differentiated. The terminal cost has no curvature of the model and stays as it is. Where
     `lifts` is false P is the identity, and the QP may be indefinite.
     """
 
@@ -427,6 +523,8 @@ class Exact(GaussNewton):
         self.lifts = True
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = problem.reference
+        self._ranges = problem.scale.ranges
+        self.metric = np.outer(self._ranges, self._ranges) / problem.scale.level
         x, u, symbols = _point(problem, blocks)
         chi = ca.SX.sym("chi", n)
         stage = stage_function(
@@ -464,17 +562,19 @@ class Exact(GaussNewton):
             L[:] = np.nan
             return np.nan
         if self.lifts:
-            values, vectors = np.linalg.eigh(raw)
+            values, vectors = np.linalg.eigh(raw * self.metric)
             floor = np.asarray(self.FLOOR * discounts[:, None], dtype=np.float64)
-            self.spectrum = Spectrum(values, vectors, floor)
-            lifted = np.maximum(values, floor)
-            L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
+            self.spectrum = Spectrum(values, vectors, floor, self._ranges)
+            # What is to be lifted is added: what is above the floor keeps its digits.
+            rise = np.maximum(floor - values, 0.0)
+            raw += (vectors * rise[:, None, :]) @ vectors.transpose(0, 2, 1) / self.metric
         else:
-            self.spectrum, L[:] = None, raw
+            self.spectrum = None
         at = np.concatenate([x, u], axis=1) - self._reference
-        curved = np.einsum("kij,kj->ki", L, at)
+        curved = np.einsum("kij,kj->ki", raw, at)
         flat = 2 * discounts[:, None] * (at @ self._B)
-        q[:] = flat + discounts[:, None] * self._b - curved
+        L[:] = raw * self.bend
+        q[:] = (flat + discounts[:, None] * self._b - curved) * self.slope
         return float((at * (curved - flat)).sum() / 2)
 
 

@@ -240,8 +240,9 @@ def test_predictions_follow_the_linearised_model_and_its_slack():
         solution = Feedback(nmpc, theta.theta, point, s)()
         x = solution.predicted_states
         np.testing.assert_allclose(x[0], s, rtol=1e-15)
-        y = (solution.qp.rows @ solution.multipliers.v).reshape(-1, 2)
-        lower = solution.qp.row_lower.reshape(-1, 2)
+        state = nmpc.problem.scale.state
+        y = (solution.qp.rows @ solution.multipliers.v).reshape(-1, 2) * state
+        lower = solution.qp.row_lower.reshape(-1, 2) * state
         np.testing.assert_allclose(y - lower, x[1:] - theta["x_l"], atol=1e-9)
         outside = np.maximum(theta["x_l"] - x[1:], x[1:] - theta["x_u"])
         np.testing.assert_allclose(solution.slack, np.maximum(outside, 0), atol=1e-12)

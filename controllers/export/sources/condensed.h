@@ -104,11 +104,13 @@ static void rti_guess(const RtiPrepared *prepared, double set[QP_LIMITS]) {
     for (int k = 0; k < HORIZON; k++) {
         const int next = k + 1 < HORIZON ? k + 1 : k; /* the guess ends at stage N − 1 */
         for (int i = 0; i < N_U; i++)
-            set[k * N_U + i] =
-                limit_reached(prepared->u[k][i], ACTION_LOWER[i], ACTION_UPPER[i], 0);
+            set[k * N_U + i] = limit_reached(scaled_action(prepared->u[k][i], i),
+                                             scaled_action(ACTION_LOWER[i], i),
+                                             scaled_action(ACTION_UPPER[i], i), 0);
         for (int i = 0; i < N_X; i++)
-            set[QP_N + k * N_X + i] = limit_reached(prepared->x[next][i], theta[THETA_x_l + i],
-                                                    theta[THETA_x_u + i], 1);
+            set[QP_N + k * N_X + i] = limit_reached(scaled_state(prepared->x[next][i], i),
+                                                    scaled_state(theta[THETA_x_l + i], i),
+                                                    scaled_state(theta[THETA_x_u + i], i), 1);
     }
 }
 
@@ -133,7 +135,6 @@ static int rti_solve(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solv
     memcpy(solved->v, work->v, sizeof solved->v);
     memcpy(solved->lam, work->lam, sizeof solved->lam);
     memcpy(solved->nu, work->nu, sizeof solved->nu);
-    solved->residual = qp_residual(&qp, work);
     solved->iterations = work->iterations;
     return QP_SOLVED;
 }

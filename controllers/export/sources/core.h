@@ -102,11 +102,11 @@ static int core_sample(const CoreGuess *guess, const double theta[], const doubl
             solution->x[k][i] = solved.read[READ_xi + k * N_X + i] + REFERENCE_STATE[i];
     for (int k = 0; k < HORIZON; k++)
         for (int i = 0; i < N_U; i++)
-            solution->u[k][i] = solved.v[k * N_U + i] + REFERENCE_ACTION[i];
+            solution->u[k][i] = rti_action(&solved, k, i);
     rti_shift(&prepared, &solved);
     core_keep(&solution->next, &prepared);
     solution->value = solved.read[READ_value];
-    solution->residual = solved.residual;
+    solution->residual = solved.read[READ_residual];
     solution->iterations = solved.iterations;
     return RTI_SOLVED;
 }

@@ -45,13 +45,13 @@ void engine_batch(RtiPrepared *prepared, RtiSolved *solved, RtiWork *work, long 
         memcpy(solved->s, s[k], sizeof solved->s);
         failed[k] = ready != RTI_SOLVED ? ready : rti_feedback(prepared, work, solved, a);
         if (failed[k]) continue;
-        for (int i = 0; i < N_U; i++) actions[k][i] = solved->v[i] + REFERENCE_ACTION[i];
+        for (int i = 0; i < N_U; i++) actions[k][i] = rti_action(solved, 0, i);
         values[k] = solved->read[READ_value];
         if (!slope) continue;
         rti_gradient(prepared, solved);
         memcpy(slope, solved->read + READ_chi, N_X * sizeof(double));
         memcpy(slope + N_X, solved->gradient, sizeof solved->gradient);
-        for (int i = 0; a && i < N_U; i++) slope[N_X + N_THETA + i] = -solved->nu[i];
+        for (int i = 0; a && i < N_U; i++) slope[N_X + N_THETA + i] = -solved->nu[i] * (COST_SCALE / SCALE_ACTION[i]);
         if (!a && rti_policy(prepared, solved, work, slope + VALUE) != QP_SOLVED) failed[k] = -1;
     }
 }
@@ -182,7 +182,7 @@ long long engine_run(Loop *loop, const Plant *plant, long long first, long long 
         if (failed) rti_start(loop->prepared);
         for (int i = 0; !failed && i < N_U; i++)
             loop->applied[i] =
-                qp_clip(loop->solved->v[i] + REFERENCE_ACTION[i], ACTION_LOWER[i], ACTION_UPPER[i]);
+                qp_clip(rti_action(loop->solved, 0, i), ACTION_LOWER[i], ACTION_UPPER[i]);
         memcpy(table, plant->state, N_X * sizeof(double));
         memcpy(table + N_X, loop->applied, N_U * sizeof(double));
         table += N_W;
@@ -195,7 +195,7 @@ long long engine_run(Loop *loop, const Plant *plant, long long first, long long 
         memcpy(table, plant->output, plant->n_outputs * sizeof(double));
         table += plant->n_outputs;
         *table++ = failed ? NAN : loop->solved->read[READ_value];
-        *table++ = failed ? NAN : loop->solved->residual;
+        *table++ = failed ? NAN : loop->solved->read[READ_residual];
         *table++ = failed;
         *table++ = middle - begin;
         *table++ = solved - middle;

@@ -14,9 +14,6 @@
 
 enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE };
 
-/* The largest KKT residual of a QP that counts as solved. */
-#define RTI_RESIDUAL 1e-6
-
 /* A QP without its state. Given: the point of linearisation (states x_0 … x_{N−1}, actions, costates
  * χ_1 … χ_N) and θ. `stack` has what `controllers.rti.preparation` makes of it. Doubles only, in the order
  * in which Python has them (`controllers.rti.nmpc`). */
@@ -29,14 +26,28 @@ typedef struct {
 } RtiPrepared;
 
 /* A state, the solution of its QP, and what CasADi's `readout` and `embedding` make of them. The
- * residual and the iterations are the solver's; `gradient` is dV/dθ or dQ/dθ where it was asked for. */
+ * iterations are the solver's; `gradient` is dV/dθ or dQ/dθ where it was asked for. The QP is in units
+ * of SCALE_STATE and SCALE_ACTION, what is read out in the model's. */
 typedef struct {
-    double s[N_X], v[QP_N], lam[QP_ROWS], constant;
+    double s[N_X], v[QP_N], lam[QP_ROWS], nu[QP_N], lower[QP_N], upper[QP_N], constant;
     double read[READ_SIZE];
     double embedded[EMBEDDED_SIZE];
-    double nu[QP_N], lower[QP_N], upper[QP_N];
-    double residual, iterations, gradient[N_THETA];
+    double iterations, gradient[N_THETA];
 } RtiSolved;
+
+/* Action i of stage k, in the model's units. */
+static double rti_action(const RtiSolved *solved, int k, int i) {
+    return solved->v[k * N_U + i] * SCALE_ACTION[i] + REFERENCE_ACTION[i];
+}
+
+/* The QP's variables and rows that stand for an action and a state. */
+static double scaled_action(double action, int i) {
+    return (action - REFERENCE_ACTION[i]) / SCALE_ACTION[i];
+}
+
+static double scaled_state(double state, int i) {
+    return (state - REFERENCE_STATE[i]) / SCALE_STATE[i];
+}
 
 /* Make the solution, its first stage dropped and its last control repeated, the next guess. */
 static void rti_shift(RtiPrepared *prepared, const RtiSolved *solved) {
@@ -68,12 +79,17 @@ static QP_APART void rti_linearise(RtiPrepared *prepared) {
     double *const A = prepared->stack + PREPARED_A, *const B = prepared->stack + PREPARED_B;
     double *const r = prepared->stack + PREPARED_r;
     for (int k = 0; k < HORIZON; k++) {
+        /* In arrays of its own: gcc 12 has lost results that go through pointers into a larger one. */
+        double by_state[N_X * N_X], by_action[N_X * N_U], offset[N_X];
         const double *arguments[LINEARISE_ARG] = {prepared->x[k], prepared->u[k], prepared->theta};
-        double *results[LINEARISE_RES] = {A + k * N_X * N_X, B + k * N_X * N_U, r + k * N_X};
+        double *results[LINEARISE_RES] = {by_state, by_action, offset};
         double w[LINEARISE_W + 1];
         long long int iw[LINEARISE_IW + 1];
         /* A function inside the model, such as a root finder, may fail. */
-        if (linearise(arguments, results, iw, w, 0)) r[k * N_X] = NAN;
+        if (linearise(arguments, results, iw, w, 0)) offset[0] = NAN;
+        memcpy(A + k * N_X * N_X, by_state, sizeof by_state);
+        memcpy(B + k * N_X * N_U, by_action, sizeof by_action);
+        memcpy(r + k * N_X, offset, sizeof offset);
     }
 }
 
@@ -82,8 +98,9 @@ static int rti_prepare(RtiPrepared *prepared) {
     const double *const theta = prepared->theta;
     for (int k = 0; k < HORIZON; k++)
         for (int i = 0; i < N_X; i++) {
-            prepared->w[k * N_X + i] = SLACK_DISCOUNTS[k] * SLACK_LINEAR(theta)[i];
-            prepared->W[k * N_X + i] = SLACK_DISCOUNTS[k] * SLACK_QUADRATIC(theta)[i];
+            const double price = STATE_PRICE[i], steep = SCALE_STATE[i] / STATE_PRICE[i];
+            prepared->w[k * N_X + i] = SLACK_DISCOUNTS[k] * (SLACK_LINEAR(theta)[i] / price);
+            prepared->W[k * N_X + i] = SLACK_DISCOUNTS[k] * (SLACK_QUADRATIC(theta)[i] * steep);
         }
     prepared->constant = stage_costs(prepared->x[0], prepared->u[0], prepared->costates[0], theta,
                                      prepared->L, prepared->q);
@@ -107,8 +124,8 @@ static void rti_kink(const RtiPrepared *prepared, RtiSolved *solved) {
     if (count == 0) return;
     for (int j = 0; j < N_U; j++) {
         const double v = solved->v[j], width = 1e-8 * (1.0 + fabs(v));
-        inside[j] = v > ACTION_LOWER[j] - REFERENCE_ACTION[j] + width &&
-                    v < ACTION_UPPER[j] - REFERENCE_ACTION[j] - width;
+        inside[j] = v > scaled_action(ACTION_LOWER[j], j) + width &&
+                    v < scaled_action(ACTION_UPPER[j], j) - width;
         total[j] = solved->nu[j];
         for (int c = 0; c < count; c++) {
             G[c][j] = inside[j] ? rows[near[c]][j] : 0.0;
@@ -163,26 +180,27 @@ static int rti_feedback(const RtiPrepared *prepared, RtiWork *work, RtiSolved *s
                         const double a[]) {
     const double *const stack = prepared->stack;
     for (int k = 0; k < QP_N; k++) {
-        solved->lower[k] = ACTION_LOWER[k % N_U] - REFERENCE_ACTION[k % N_U];
-        solved->upper[k] = ACTION_UPPER[k % N_U] - REFERENCE_ACTION[k % N_U];
+        solved->lower[k] = scaled_action(ACTION_LOWER[k % N_U], k % N_U);
+        solved->upper[k] = scaled_action(ACTION_UPPER[k % N_U], k % N_U);
     }
-    for (int i = 0; a && i < N_U; i++) solved->lower[i] = solved->upper[i] = a[i] - REFERENCE_ACTION[i];
+    for (int i = 0; a && i < N_U; i++) solved->lower[i] = solved->upper[i] = scaled_action(a[i], i);
     if (a && !all_finite(a, N_U)) return QP_NOT_FINITE;
     const int status = rti_solve(prepared, work, solved, a != 0);
     if (status != QP_SOLVED) return status;
-    if (!(solved->residual <= RTI_RESIDUAL)) return RTI_INACCURATE;
     if (a) rti_kink(prepared, solved);
     solved->constant = prepared->constant;
     {
         const double *arguments[READ_ARG] = {
-            solved->s,     solved->v,   solved->lam, stack + PREPARED_A, stack + PREPARED_B,
-            stack + PREPARED_r, prepared->L, prepared->q, prepared->L_N, prepared->q_N,
-            &solved->constant, prepared->theta};
+            solved->s,          solved->v,          solved->lam,        solved->nu,
+            solved->lower,      solved->upper,      stack + PREPARED_A, stack + PREPARED_B,
+            stack + PREPARED_r, prepared->L,        prepared->q,        prepared->L_N,
+            prepared->q_N,      &solved->constant,  prepared->theta};
         double *results[READ_RES] = {solved->read}, w[READ_W + 1];
         long long int iw[READ_IW + 1];
         readout(arguments, results, iw, w, 0);
     }
-    return all_finite(solved->read, READ_SIZE) ? RTI_SOLVED : QP_NOT_FINITE;
+    if (!all_finite(solved->read, READ_SIZE)) return QP_NOT_FINITE;
+    return solved->read[READ_residual] <= RTI_RESIDUAL ? RTI_SOLVED : RTI_INACCURATE;
 }
 
 #endif

@@ -352,35 +352,6 @@ static QpStatus stages_solve(const RtiPrepared *prepared, RtiWork *work, int fir
     return QP_SOLVED;
 }
 
-/* Largest KKT residual, as `qp_residual` has it. */
-static double stages_residual(const RtiPrepared *prepared, const RtiSolved *solved, RtiWork *work) {
-    double zero[QP_N] = {0.0}, f[QP_N], pull[QP_N], at_zero[(HORIZON + 1) * N_X], none[(HORIZON + 1) * N_X];
-    double stationarity = 0.0, scale = 1.0, largest = 0.0;
-    memset(none, 0, sizeof none);
-    memcpy(at_zero, work->xi, N_X * sizeof(double));
-    stages_simulate(prepared, 0, 1, zero, at_zero);
-    stages_simulate(prepared, 0, 1, solved->v, work->xi);
-    stages_gradient(prepared, 0, 1, zero, at_zero, 0, f);
-    stages_gradient(prepared, 0, 0, zero, none, solved->lam, pull);
-    stages_gradient(prepared, 0, 1, solved->v, work->xi, solved->lam, work->gradient);
-    for (int j = 0; j < QP_N; j++) {
-        const double curved = work->gradient[j] - f[j] - pull[j], v = solved->v[j];
-        stationarity = qp_max(stationarity, fabs(work->gradient[j] + solved->nu[j]));
-        scale = qp_max(scale, qp_max(fabs(f[j]), qp_max(fabs(curved), fabs(pull[j]))));
-        largest = qp_max(
-            largest, fabs(v - qp_clip(v + solved->nu[j], solved->lower[j], solved->upper[j])));
-    }
-    for (int r = 0; r < QP_ROWS; r++) {
-        const double y = work->xi[N_X + r], shifted = y + solved->lam[r];
-        const double nearest = qp_clip(shifted, work->lower[QP_N + r], work->upper[QP_N + r]);
-        const double beyond = shifted - nearest;
-        const double shrunk =
-            qp_max(fabs(beyond) - prepared->w[r], 0.0) / (1.0 + 2.0 * prepared->W[r]);
-        largest = qp_max(largest, fabs(y - nearest - copysign(shrunk, beyond)));
-    }
-    return qp_max(largest, stationarity / scale);
-}
-
 static int rti_assemble(const RtiPrepared *prepared) {
     return all_finite(prepared->stack, PREPARED_H) ? QP_SOLVED : QP_NOT_FINITE;
 }
@@ -399,16 +370,16 @@ static int rti_load(const RtiPrepared *prepared, RtiWork *work) {
 /* Solve the QP of the state in `solved`, with the first action enforced or not. */
 static int rti_solve(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solved, int enforced) {
     const double *const theta = prepared->theta;
-    for (int i = 0; i < N_X; i++) work->xi[i] = solved->s[i] - REFERENCE_STATE[i];
+    for (int i = 0; i < N_X; i++) work->xi[i] = scaled_state(solved->s[i], i);
     for (int j = 0; j < QP_N; j++) {
         work->lower[j] = solved->lower[j];
         work->upper[j] = solved->upper[j];
-        work->v[j] = qp_clip(prepared->u[j / N_U][j % N_U] - REFERENCE_ACTION[j % N_U], work->lower[j],
+        work->v[j] = qp_clip(scaled_action(prepared->u[j / N_U][j % N_U], j % N_U), work->lower[j],
                              work->upper[j]);
     }
     for (int r = 0; r < QP_ROWS; r++) {
-        work->lower[QP_N + r] = theta[THETA_x_l + r % N_X] - REFERENCE_STATE[r % N_X];
-        work->upper[QP_N + r] = theta[THETA_x_u + r % N_X] - REFERENCE_STATE[r % N_X];
+        work->lower[QP_N + r] = scaled_state(theta[THETA_x_l + r % N_X], r % N_X);
+        work->upper[QP_N + r] = scaled_state(theta[THETA_x_u + r % N_X], r % N_X);
     }
     if (!all_finite(work->xi, N_X)) return QP_NOT_FINITE;
     const QpStatus status = stages_solve(prepared, work, enforced);
@@ -429,7 +400,6 @@ static int rti_solve(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solv
         stages_gradient(prepared, 0, 1, solved->v, work->xi, solved->lam, work->gradient);
         for (int j = 0; j < N_U; j++) solved->nu[j] = -work->gradient[j];
     }
-    solved->residual = stages_residual(prepared, solved, work);
     solved->iterations = work->iterations;
     return QP_SOLVED;
 }
@@ -439,12 +409,11 @@ static void rti_first_rows(const RtiPrepared *prepared, const RtiSolved *solved,
                            double rows[N_X][N_U], double low[N_X], double high[N_X]) {
     const Stage at = stage_of(prepared, 0);
     for (int i = 0; i < N_X; i++) {
-        double unmoved = at.r[i] + REFERENCE_STATE[i];
-        for (int j = 0; j < N_X; j++)
-            unmoved += at.A[i * N_X + j] * (solved->s[j] - REFERENCE_STATE[j]);
+        double unmoved = at.r[i];
+        for (int j = 0; j < N_X; j++) unmoved += at.A[i * N_X + j] * scaled_state(solved->s[j], j);
         memcpy(rows[i], at.B + i * N_U, sizeof rows[i]);
-        low[i] = prepared->theta[THETA_x_l + i] - unmoved;
-        high[i] = prepared->theta[THETA_x_u + i] - unmoved;
+        low[i] = scaled_state(prepared->theta[THETA_x_l + i], i) - unmoved;
+        high[i] = scaled_state(prepared->theta[THETA_x_u + i], i) - unmoved;
     }
 }
 
@@ -454,14 +423,14 @@ static inline int rti_directions(const RtiPrepared *prepared, const RtiSolved *s
                           double dv[N_U][QP_N], double dt[N_U][QP_ROWS], double dlam[N_U][QP_ROWS]) {
     int status = rti_load(prepared, work);
     if (status != QP_SOLVED) return status;
-    for (int i = 0; i < N_X; i++) work->xi[i] = solved->s[i] - REFERENCE_STATE[i];
+    for (int i = 0; i < N_X; i++) work->xi[i] = scaled_state(solved->s[i], i);
     stages_simulate(prepared, 0, 1, solved->v, work->xi);
     for (int i = 0; i < QP_LIMITS; i++) {
         const int r = i - QP_N;
         const double low = i < QP_N ? solved->lower[i]
-                                    : prepared->theta[THETA_x_l + r % N_X] - REFERENCE_STATE[r % N_X];
+                                    : scaled_state(prepared->theta[THETA_x_l + r % N_X], r % N_X);
         const double high = i < QP_N ? solved->upper[i]
-                                     : prepared->theta[THETA_x_u + r % N_X] - REFERENCE_STATE[r % N_X];
+                                     : scaled_state(prepared->theta[THETA_x_u + r % N_X], r % N_X);
         const double y = i < QP_N ? solved->v[i] : work->xi[N_X + r];
         const double reach =
             fabs(i < QP_N ? solved->nu[i] : solved->lam[r]) + qp_max(low - y, y - high);

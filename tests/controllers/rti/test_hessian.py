@@ -27,7 +27,8 @@ def filled(name, prepared, blocks, problem, parameters, point):
     rule.set_parameters(parameters)
     constant = rule.fill(*point)
     L, q = (prepared.inputs[part].reshape(N, n + m, -1).copy() for part in ("L", "q"))
-    return rule, L, q[:, :, 0], constant
+    both, cost = problem.scale.both, problem.scale.cost
+    return rule, L / np.outer(both, both) * cost, q[:, :, 0] / both * cost, constant
 
 
 def lift(matrix, floor):
@@ -37,7 +38,13 @@ def lift(matrix, floor):
 
 def spectrum_of(matrix, floor):
     values, vectors = np.linalg.eigh(matrix[None])
-    return Spectrum(values, vectors, np.array([[floor]]))
+    return Spectrum(values, vectors, np.array([[floor]]), np.ones(len(matrix)))
+
+
+def lift_in_units(matrix, floor, scale):
+    """The lift of the block over the ranges of (x, u) and relative to the level of the cost."""
+    metric = np.outer(scale.ranges, scale.ranges) / scale.level
+    return lift(matrix * metric, floor) / metric
 
 
 def test_gauss_newton_is_the_discounted_cost_itself(prepared, blocks, problem, rng):
@@ -49,11 +56,14 @@ def test_gauss_newton_is_the_discounted_cost_itself(prepared, blocks, problem, r
         np.testing.assert_allclose(L[k], 2 * DISCOUNTS[k] * parameters["B_l"], rtol=1e-14)
         np.testing.assert_allclose(q[k], DISCOUNTS[k] * parameters["b_l"], rtol=1e-14)
     assert constant == 0.0
-    end = 0.99**N
+    end, scale = 0.99**N, problem.scale
+    slope = scale.state / scale.cost
     np.testing.assert_allclose(
-        prepared.inputs["L_N"].reshape(n, n), 2 * end * parameters["B_Vf"], rtol=1e-14
+        prepared.inputs["L_N"].reshape(n, n),
+        2 * end * parameters["B_Vf"] * np.outer(slope, scale.state),
+        rtol=1e-14,
     )
-    np.testing.assert_allclose(prepared.inputs["q_N"], end * parameters["b_Vf"], rtol=1e-14)
+    np.testing.assert_allclose(prepared.inputs["q_N"], end * parameters["b_Vf"] * slope, rtol=1e-14)
 
 
 def test_exact_unlifted_is_the_hessian_of_the_stage_lagrangian(prepared, blocks, problem, rng):
@@ -79,12 +89,15 @@ def test_exact_lifts_only_what_is_below_the_floor(prepared, blocks, problem, rng
     point.costates[:5] *= -300
     _, raw, _, _ = filled("exact-unlifted", prepared, blocks, problem, parameters, point)
     _, L, _, _ = filled("exact", prepared, blocks, problem, parameters, point)
-    least = np.linalg.eigvalsh(raw)[:, 0]
+    scale = problem.scale
+    metric = np.outer(scale.ranges, scale.ranges) / scale.level
+    least = np.linalg.eigvalsh(raw * metric)[:, 0]
     assert (least < 0).any(), "the test needs indefinite blocks"
     assert (least > Exact.FLOOR).any(), "the test needs definite blocks"
     for k in range(N):
-        np.testing.assert_allclose(L[k], lift(raw[k], Exact.FLOOR * DISCOUNTS[k]), atol=1e-10)
-    assert (np.linalg.eigvalsh(L)[:, 0] >= 0.999 * Exact.FLOOR * DISCOUNTS).all()
+        expected = lift_in_units(raw[k], Exact.FLOOR * DISCOUNTS[k], scale)
+        np.testing.assert_allclose(L[k], expected, atol=1e-10)
+    assert (np.linalg.eigvalsh(L * metric)[:, 0] >= 0.999 * Exact.FLOOR * DISCOUNTS).all()
 
 
 @pytest.mark.parametrize("name", ["exact", "exact-unlifted"])

@@ -81,7 +81,9 @@ def test_the_linear_model_touches_the_nonlinear_one_at_its_point(functions, case
     f = discretise(problem.model, problem.sampling_time, problem.substeps)
     A, B = prepared.part("A").reshape(N, n, n), prepared.part("B").reshape(N, n, m)
     for k in range(N):
-        xi, v = point.x[k] - problem.reference_state, point.u[k] - problem.reference_action
+        scale = problem.scale
+        xi = (point.x[k] - problem.reference_state) / scale.state
+        v = (point.u[k] - problem.reference_action) / scale.action
         linear = A[k] @ xi + B[k] @ v + prepared.matrix("r")[k] + problem.reference_state
         exact = f(point.x[k], point.u[k], problem.model.nominal_disturbance, p)
         np.testing.assert_allclose(linear, np.array(exact).ravel() + parameters["c_f"], rtol=1e-13)
@@ -115,13 +117,13 @@ def test_embedding_puts_the_state_into_gradient_and_limits(functions, case, prob
     parameters, s = case[0], random_state(problem, rng)
     embed.inputs["s"][:], embed.inputs["theta"][:] = s, parameters.theta
     embed()
-    xi_0, v = s - problem.reference_state, rng.normal(size=(N, m)) * 20
+    xi_0, v = (s - problem.reference_state) / problem.scale.state, rng.normal(size=(N, m))
     np.testing.assert_allclose(
         embed.part("f"), prepared.part("f") + prepared.matrix("F") @ xi_0, rtol=1e-12, atol=1e-9
     )
     # The rows' distances to their limits are the states' distances to their bounds.
     y = prepared.matrix("Gamma") @ v.ravel()
-    x = simulate(prepared, xi_0, v)[1:] + problem.reference_state
+    x = simulate(prepared, xi_0, v)[1:] * problem.scale.state + problem.reference_state
     for side, bound in (("lower", "x_l"), ("upper", "x_u")):
         np.testing.assert_allclose(
             (y - embed.part(side)).reshape(N, n), x - parameters[bound], rtol=0, atol=1e-10

@@ -28,7 +28,7 @@ TABLES = [
 
 @pytest.fixture
 def twice(tmp_path):
-    """Give the stored tables of a study and a copy to change: those named, and what must be there."""
+    """Give some stored tables of a study, and a copy to change."""
 
     def copy(study, *tables):
         for name in ("stored", "now"):

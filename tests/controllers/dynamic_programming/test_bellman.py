@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -16,11 +18,17 @@ GRID = Grid((np.linspace(20, 32, 13), np.linspace(40, 60, 5)))
 STATE, ACTION = np.array([[25.8, 50.0]]), np.array([[226.0, 217.0]])
 
 
-def operator(penalty_nodes=(20, 20, 4, 2)):
-    return BellmanOperator(PLANT, Accuracy(8, (7, 7, 2, 2), penalty_nodes))
+def operator(penalty_nodes=(20, 20, 4, 2), plant=PLANT):
+    return BellmanOperator(plant, Accuracy(8, (7, 7, 2, 2), penalty_nodes))
 
 
-def test_expected_cost_and_penalty_agree_with_monte_carlo():
+@pytest.mark.parametrize(
+    ("linear", "quadratic"), [(1e5, 1.0), (1.0, 1e7)], ids=["linear", "quadratic"]
+)
+def test_expected_cost_and_penalty_agree_with_monte_carlo(linear, quadratic):
+    weights = {"penalty_linear": linear, "penalty_quadratic": quadratic}
+    problem = replace(PROBLEM, **{name: np.full(2, weight) for name, weight in weights.items()})
+    plant = PlantProblem(problem, LAW, P)
     count = 50_000
     d = LAW.draw(np.random.default_rng(11), count)
     x, u = np.tile(STATE.T, (1, count)), np.tile(ACTION.T, (1, count))
@@ -28,10 +36,11 @@ def test_expected_cost_and_penalty_agree_with_monte_carlo():
     x_next = discretise(PROBLEM.model, 60.0, 8).map(count)(x, u, d.T, p).full()
     cost = economic_cost(PROBLEM.model).map(count)(x, u, d.T, p).full()[0]
     violation = np.maximum(25.0 - x_next[0], 0.0)
-    penalty = 1e5 * violation + violation**2
+    penalty = linear * violation + quadratic * violation**2
     sampled = cost + penalty
     assert 2e-4 < (violation > 0).mean() < 0.1
-    value = operator().values(STATE, ACTION, GRID, np.zeros(GRID.size))[0]
+    value = operator(plant=plant).values(STATE, ACTION, GRID, np.zeros(GRID.size))[0]
+    assert penalty.mean() > 8 * sampled.std() / np.sqrt(count), "it would not be missed"
     assert value == pytest.approx(sampled.mean(), abs=4 * sampled.std() / np.sqrt(count))
 
 

@@ -49,7 +49,9 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     """
     below = float(np.mean(denominator))
     value = float(np.mean(numerator)) / below if below else float("nan")
-    return Estimate(value, _t_interval((numerator - value * denominator) / (below or 1.0), value))
+    with np.errstate(invalid="ignore"):  # an infinite cost has no interval
+        residuals = (numerator - value * denominator) / (below or 1.0)
+    return Estimate(value, _t_interval(residuals, value))
 
 
 def bootstrapped(numerator: Array, denominator: Array) -> Interval:

@@ -245,7 +245,10 @@ def to_csv(rows: Sequence[LogRow]) -> str:
 
 
 def _cell(value: float) -> str:
-    return "" if isnan(value) else repr(int(value) if value == int(value) else value)
+    if isnan(value):
+        return ""
+    whole = isfinite(value) and value == int(value)  # the cost of a diverged run is infinite
+    return repr(int(value) if whole else value)
 
 
 def _total(values: Iterable[float]) -> float:

@@ -199,6 +199,7 @@ def check(
         quick = stored.chosen(studies, names or checked)
         for name in quick:
             cosim.StudyResults.load(folder / name)
+            stored.compared_tables(folder / name)  # an unknown table is refused before the work
         found: dict[str, list[str]] = {}
         with temporary_folder("cosim-results-") as work:
             for name in quick:

@@ -57,11 +57,9 @@ def optimum_at(scenario: Scenario, sample: int) -> Controller:
 def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dict[int, float], int]:
     """Take the samples of a run on its plant; rows of `LIFE` and θ after each of the `marks`.
 
-    Also the status, the processor time in s by mark, and the plant samples taken. `J` is the mean
-    cost of all samples so far; since the first change of θ (the start, where θ rests) `violating`
-    is the share of violating samples and `dearest` the largest mean cost of `WINDOW` samples in a
-    row; `dearer` and `excess` compare with θ at the start (`dearer_than`). The cost of a diverged
-    run is infinite.
+    Also the status, the processor time in s by mark, and the plant samples taken. `metrics` has the
+    rows' costs; `updates` and `model_samples` are numbers so far. The cost of a diverged run is
+    infinite.
     """
     cost, violating = np.full(run.samples, np.inf), np.ones(run.samples, dtype=bool)
     rows: list[LogRow] = []
@@ -88,21 +86,44 @@ def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dic
             if k + 1 not in marks:
                 continue
             clock[k + 1] = process_time() - start
-            since = violating[first : k + 1]
-            dearer, excess = dearer_than(before[first : k + 1], cost[first : k + 1])
-            figures = {
-                "samples": k + 1,
-                "J": float(cost[: k + 1].mean()),
-                "violating": float(since.mean()) if len(since) else np.nan,
-                "dearest": dearest(cost[first : k + 1]),
-                "first_change": first or np.nan,
-                "updates": updates,
-                "model_samples": int(getattr(loop.algorithm, "model_samples", 0)),
-                "dearer": dearer if first else np.nan,
-                "excess": excess if first else np.nan,
+            figures = metrics(k + 1, before, cost, violating, first) | {
+                "updates": float(updates),
+                "model_samples": float(getattr(loop.algorithm, "model_samples", 0)),
             }
             rows.append(LogRow(figures, loop.parameters))
         return rows, status, clock, loop.counts.number
+
+
+def metrics(
+    samples: int, before: Array, cost: Array, violating: Array, first_change: int
+) -> dict[str, float]:
+    """What the first samples of a run in operation cost.
+
+    Args:
+        samples: Number of the run's samples so far.
+        before: Cost (K,) that the start's θ has in each sample of the run, on the same noise.
+        cost: Cost (K,) of each sample.
+        violating: Whether each sample violates a bound, (K,).
+        first_change: Number of samples before the first one with another θ; 0 while θ rests.
+
+    Returns:
+        `samples`; `J`, the mean cost of all of them; `first_change`, NaN while θ rests; of the
+        samples since then (of all, while θ rests) the share of `violating` ones and `dearest`, the
+        largest mean cost of `WINDOW` samples in a row; `dearer` and `excess` of `dearer_than`, NaN
+        while θ rests. A figure of no sample is NaN.
+    """
+    changed = first_change > 0
+    since = slice(first_change, samples)
+    dearer, excess = dearer_than(before[since], cost[since]) if changed else (np.nan, np.nan)
+    return {
+        "samples": float(samples),
+        "J": float(cost[:samples].mean()),
+        "violating": float(violating[since].mean()) if first_change < samples else np.nan,
+        "dearest": dearest(cost[since]),
+        "first_change": float(first_change) if changed else np.nan,
+        "dearer": dearer,
+        "excess": excess,
+    }
 
 
 def dearest(cost: Array) -> float:

@@ -23,7 +23,7 @@ from learning.errors import ConfigurationError
 from learning.training import HELD_OUT, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
-TRAJECTORIES, LOGS = "trajectories", "logs"
+TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"
 """Folders of what a study keeps of its runs."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
@@ -339,7 +339,7 @@ def plan(study: Study) -> Plan:
         kept = {t.file: f"{TRAJECTORIES}/{t.name}/{where}/{stem}.csv" for t in tables}
         if first and case.name in study.table.logs:
             kept[LOG] = f"{LOGS}/{where}-{stem}.csv"
-            kept[PARAMETERS] = f"parameters/{where}-{stem}.toml"
+            kept[PARAMETERS] = f"{THETA}/{where}-{stem}.toml"
         seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
         if training is None and seeds:  # the optimum, on the noise of the training seeds
             noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}

@@ -17,17 +17,40 @@ from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
-from cosim.studies.plan import LOGS, TRAJECTORIES
+from cosim.studies.plan import LOGS, THETA, TRAJECTORIES
 from cosim.studies.report import rendered
-from cosim.studies.results import ABOUT, CURVES, KEYS, StudyResults
-from cosim.studies.run import EVALUATION, RUNS, TIMING, to_csv
+from cosim.studies.results import (
+    ABOUT,
+    AGGREGATE,
+    CURVES,
+    KEYS,
+    OPERATION,
+    SUMMARY,
+    WHERE,
+    StudyResults,
+)
+from cosim.studies.results import RUNS as RUNS_TABLE
+from cosim.studies.run import EVALUATION, GREEDY, RUNS, TIMING, to_csv
 from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"
 """Folder within the folder, of the runs of studies."""
-UNCOMPARED = ["status", "residual"]
-"""Columns without a tolerance: words, and values of the size of rounding."""
+WORDS = ("status", "against", "hash")
+"""Columns that hold words, which must be the same; every other one holds numbers."""
+KEY_COLUMNS = {
+    EVALUATION: [*KEYS, "seed"],
+    CURVES: [*KEYS, "samples"],
+    RUNS_TABLE: KEYS,
+    SUMMARY: WHERE,
+    AGGREGATE: ["case"],
+    OPERATION: [*KEYS, "samples"],
+    GREEDY: [*KEYS, "samples", "seed"],
+    LOGS: ["samples"],
+    TRAJECTORIES: ["time"],
+    THETA: ["schema"],
+}
+"""Key columns of a study's tables, by their file or by the folder that they are in."""
 LARGEST = 4_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
 SUFFIXES = (".csv", ".toml", ".md", ".svg", ".png")
@@ -110,12 +133,34 @@ def load_tolerances(folder: Path) -> dict[str, Tolerance]:
 
 
 def compared_tables(folder: Path) -> dict[str, list[str]]:
-    """Key columns of the tables of a study's folder that a check compares."""
-    found = {EVALUATION: [*KEYS, "seed"], CURVES: [*KEYS, "samples"]}
-    for kept, key in ((LOGS, "samples"), (TRAJECTORIES, "time")):
-        for path in sorted((folder / kept).glob("**/*.csv")):
-            found[path.relative_to(folder).as_posix()] = [key]
-    return found
+    """Every table of a study's folder that a check compares, with its key columns.
+
+    These are all CSV files and all θ files, but for the runs' own folders and the times. Figures,
+    pages and study.json, which names versions and the code's hash, are not tables.
+
+    Args:
+        folder: Folder of a stored study or of one that was run.
+
+    Returns:
+        Key columns by the table's path relative to the folder.
+
+    Raises:
+        ResultsError: A table is of a kind without key columns.
+    """
+    tables: dict[str, list[str]] = {}
+    for path in sorted(folder.rglob("*")):
+        relative = path.relative_to(folder)
+        top = relative.parts[0]
+        if path.suffix not in (".csv", ".toml") or relative.name == TIMING or top == RUNS:
+            continue
+        keys = KEY_COLUMNS.get(top)
+        if keys is None:
+            raise ResultsError(
+                f"the table '{path}' is of an unknown kind: give '{top}' its key columns in "
+                f"{Path(__file__).name}"
+            )
+        tables[relative.as_posix()] = keys
+    return tables
 
 
 def differences(
@@ -123,69 +168,120 @@ def differences(
 ) -> list[str]:
     """Differences of a stored study from the same computed now, in words.
 
-    Trajectories come first: they name the signal in which a difference begins. Raises ResultsError
-    where a stored table is missing or damaged, or a signal has no tolerance.
+    Trajectories and logs come first: they name the signal in which a difference begins.
+
+    Args:
+        name: The study's name, for the messages.
+        stored: Folder of its stored tables.
+        now: Folder of the tables that were computed now.
+        tolerances: Tolerances of the columns.
+
+    Raises:
+        ResultsError: A stored table is damaged, evaluation or curves are missing, or a column has
+            no tolerance.
     """
-    wanted, found = compared_tables(stored), compared_tables(now)
-    extra = [table for table in found if table not in wanted]
-    lines = [f"{name}: {table} is computed but not stored" for table in extra]
-    for table, keys in reversed(wanted.items()):
-        if not (stored / table).is_file():
+    wanted, computed = compared_tables(stored), compared_tables(now)
+    for table in (EVALUATION, CURVES):
+        if table not in wanted:
             raise ResultsError(
                 f"the stored table '{stored / table}' is missing; make it with: "
                 f"cosim results update {name}"
             )
-        if not (now / table).is_file():
+    lines = [
+        f"{name}: {table} is computed but not stored" for table in computed if table not in wanted
+    ]
+    in_folders_first = sorted(wanted, key=lambda table: ("/" not in table, table))
+    for table in in_folders_first:
+        if table not in computed:
             lines.append(f"{name}: {table} is stored but not computed any more")
             continue
-        one, other = (_read(folder / table, keys) for folder in (stored, now))
-        lines += _table_differences(f"{name}/{table}", one, other, tolerances)
+        before = _read(stored / table, wanted[table])
+        after = _read(now / table, wanted[table])
+        lines += _table_differences(f"{name}/{table}", before, after, tolerances)
     return lines
 
 
 def _read(path: Path, keys: list[str]) -> pd.DataFrame:
-    """A stored CSV by its key columns; `attrs` are the units of its signals."""
+    """A stored table by its key columns.
+
+    The columns named in `WORDS` hold texts, all others floats. `attrs` has the columns' units.
+    """
     try:
-        frame = pd.read_csv(path, dtype=str, na_filter=False)
+        if path.suffix == ".toml":
+            frame = _theta_table(path)
+        else:
+            frame = pd.read_csv(path, dtype=str, na_filter=False)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise ResultsError(f"the stored table '{path}' cannot be read: {error}") from None
-    parts = {title: title.removesuffix("]").partition(" [") for title in frame}
-    frame = frame.rename(columns={title: name for title, (name, _, _) in parts.items()})
+    units: dict[str, str] = {}
+    names: dict[str, str] = {}
+    for title in frame:
+        name, _, unit = title.partition(" [")
+        names[title] = name
+        units[name] = unit.removesuffix("]")
+    frame = frame.rename(columns=names)
     try:
-        frame = frame.map(_rounded).set_index(keys).drop(columns=UNCOMPARED, errors="ignore")
-        frame = frame.replace("", "nan").astype(float)
+        frame = frame.map(_rounded).set_index(keys)
+        numbers = [column for column in frame if column not in WORDS]
+        frame = frame.replace(dict.fromkeys(numbers, ""), "nan")
+        frame = frame.astype(dict.fromkeys(numbers, float))
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the stored table '{path}' is damaged: {error}") from None
     if not frame.index.is_unique:
         raise ResultsError(f"'{path}' has two rows {frame.index[frame.index.duplicated()][0]}")
-    frame.attrs = {name: unit for name, _, unit in parts.values()}
+    frame.attrs = units
     return frame
+
+
+def _theta_table(path: Path) -> pd.DataFrame:
+    """A θ file as a table of one row: its hash, and each number of θ under its name in a log."""
+    document = read_toml(path, f"'{path}'", ResultsError)
+    row = {"schema": str(document.get("schema", "")), "hash": str(document.get("hash", ""))}
+    for block, values in document.get("theta", {}).items():
+        array = np.asarray(values, dtype=np.float64)
+        for index in np.ndindex(array.shape):
+            place = f"[{','.join(map(str, index))}]" if index else ""
+            row[f"theta {block}{place}"] = repr(float(array[index]))
+    return pd.DataFrame([row])
 
 
 def _table_differences(
     name: str, stored: pd.DataFrame, now: pd.DataFrame, tolerances: Mapping[str, Tolerance]
 ) -> list[str]:
-    """Differences of two tables in words: unmatched rows, first differing row of each signal."""
+    """Differences of two tables in words.
+
+    First rows that only one of them has, then the first differing row of each column, in the order
+    of the rows, then columns that only one of them has.
+    """
     lines, lost = [], []
-    for one, other, rows, columns in (
+    for table, other, rows, columns in (
         (stored, now, "stored but not computed any more", "stored, not computed"),
         (now, stored, "computed but not stored", "not stored"),
     ):
-        for row in one.index.difference(other.index, sort=False)[:1]:
-            lines.append(f"{name}: row {_row(one, row)} is {rows}")
-        if len(lone := one.columns.difference(other.columns, sort=False)):
+        for row in table.index.difference(other.index, sort=False)[:1]:
+            lines.append(f"{name}: row {_row(table, row)} is {rows}")
+        if len(lone := table.columns.difference(other.columns, sort=False)):
             lost.append(f"{name}: signal {', '.join(lone)} is {columns}")
     common = stored.index.intersection(now.index, sort=False)
-    signals = [signal for signal in stored if signal in now]
-    allowed = [_tolerance(s, (now.attrs | stored.attrs)[s], tolerances) for s in signals]
-    was, value = (table.loc[common, signals].to_numpy() for table in (stored, now))
-    same = np.isclose(value, was, 0.0, [one.absolute for one in allowed], equal_nan=True)
-    first = {i: k for k, i in reversed(np.argwhere(~same).tolist())}
-    for k, i in sorted((k, i) for i, k in first.items()):
-        text = f"row {_row(stored, common[k])}: signal {signals[i]} is {float(value[k, i])!r} now, "
-        text += f"{float(was[k, i])!r} stored, tolerance {allowed[i].absolute:g}"
-        lines.append(f"{name}: {text} {allowed[i].unit.removeprefix('1')}".rstrip())
-    return lines + lost
+    units = now.attrs | stored.attrs
+    first: list[tuple[int, str]] = []
+    for signal in stored.columns.intersection(now.columns, sort=False):
+        before, after = stored.loc[common, signal], now.loc[common, signal]
+        if signal in WORDS:
+            differs = (before != after).to_numpy()
+            bound = ""
+        else:
+            tolerance = _tolerance(signal, units[signal], tolerances)
+            differs = ~np.isclose(after, before, 0.0, tolerance.absolute, equal_nan=True)
+            bound = f", tolerance {tolerance.absolute:g} {tolerance.unit.removeprefix('1')}"
+        if not differs.any():
+            continue
+        k = int(np.argmax(differs))
+        values = f"{after.tolist()[k]!r} now, {before.tolist()[k]!r} stored"
+        text = f"row {_row(stored, common[k])}: signal {signal} is {values}{bound}"
+        first.append((k, f"{name}: {text}".rstrip()))
+    in_order_of_rows = [text for _, text in sorted(first, key=lambda item: item[0])]
+    return lines + in_order_of_rows + lost
 
 
 def _tolerance(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:

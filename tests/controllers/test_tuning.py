@@ -135,6 +135,28 @@ def test_rtis_local_feedback_is_the_economic_one_for_any_discount(tuning):
         np.testing.assert_allclose((above - below) / 2e-4, gain[:, i], atol=tolerance)
 
 
+def test_the_terminal_cost_falls_towards_the_active_bound_by_its_multiplier():
+    """∇V_f(x_s) = (60.29, 0): else the bound of the last stage is active without any force."""
+    problem = PROBLEMS["paper"]
+    found = tune(problem)
+    theta, away = found.parameters, found.steady_state.x - problem.reference_state
+    gradient = theta["b_Vf"] + 2 * theta["B_Vf"] @ away
+    np.testing.assert_allclose(gradient, [60.29, 0.0], atol=2e-3)
+
+
+@pytest.mark.parametrize("horizon", [1, 2])
+def test_the_local_feedback_needs_no_long_horizon(horizon):
+    """The terminal cost is the value of what follows, with the same active bound."""
+    problem = replace(PROBLEMS["paper"], horizon=horizon)
+    tuning = tune(problem)
+    controller = RtiNmpc(problem, tuning.parameters)
+    controller.prepare()
+    solution = controller.feedback(problem.reference_state)
+    assert not solution.weakly_active
+    gain = tuning.economic
+    np.testing.assert_allclose(solution.policy_state_jacobian, gain, atol=1e-5 * np.abs(gain).max())
+
+
 def test_value_is_the_economic_one_to_second_order():
     problem = PROBLEMS["undiscounted"]
     controller = RtiNmpc(problem, tune(problem).parameters.replace({"c_lambda": 0.0}))

@@ -7,6 +7,7 @@ from pydantic import Field
 
 from cosim import study
 from learning.configuration import Configuration
+from learning.errors import DivergenceError
 
 HERE = "tests.helpers.toy_study"
 GROW = f"{HERE}:Grow"
@@ -45,6 +46,15 @@ class Grow:
 class Break(Grow):
     def observe(self, transition):
         raise ZeroDivisionError("broken in the middle")
+
+
+class Diverge(Grow):
+    """Diverges at its 201st sample."""
+
+    def observe(self, transition):
+        super().observe(transition)
+        if transition.number == 200:
+            raise DivergenceError("the toy was told to")
 
 
 class Interrupt(Grow):

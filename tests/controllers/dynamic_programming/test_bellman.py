@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -16,23 +18,36 @@ GRID = Grid((np.linspace(20, 32, 13), np.linspace(40, 60, 5)))
 STATE, ACTION = np.array([[25.8, 50.0]]), np.array([[226.0, 217.0]])
 
 
-def operator(penalty_nodes=(20, 20, 4, 2)):
-    return BellmanOperator(PLANT, Accuracy(8, (7, 7, 2, 2), penalty_nodes))
+def operator(penalty_nodes=(20, 20, 4, 2), plant=PLANT):
+    return BellmanOperator(plant, Accuracy(8, (7, 7, 2, 2), penalty_nodes))
 
 
-def test_expected_cost_and_penalty_agree_with_monte_carlo():
+@pytest.mark.parametrize(
+    ("linear", "quadratic", "state"),
+    [(1e5, 1.0, STATE), (1.0, 1e6, STATE - [[0.6, 0.0]])],
+    ids=["linear", "quadratic"],
+)
+def test_expected_cost_and_penalty_agree_with_monte_carlo(linear, quadratic, state):
+    problem = replace(
+        PROBLEM,
+        penalty_linear=np.full(2, linear),
+        penalty_quadratic=np.full(2, quadratic),
+    )
+    plant = PlantProblem(problem, LAW, P)
     count = 50_000
     d = LAW.draw(np.random.default_rng(11), count)
-    x, u = np.tile(STATE.T, (1, count)), np.tile(ACTION.T, (1, count))
+    x, u = np.tile(state.T, (1, count)), np.tile(ACTION.T, (1, count))
     p = np.tile(P[:, None], (1, count))
     x_next = discretise(PROBLEM.model, 60.0, 8).map(count)(x, u, d.T, p).full()
     cost = economic_cost(PROBLEM.model).map(count)(x, u, d.T, p).full()[0]
     violation = np.maximum(25.0 - x_next[0], 0.0)
-    penalty = 1e5 * violation + violation**2
+    penalty = linear * violation + quadratic * violation**2
     sampled = cost + penalty
-    assert 2e-4 < (violation > 0).mean() < 0.1
-    value = operator().values(STATE, ACTION, GRID, np.zeros(GRID.size))[0]
-    assert value == pytest.approx(sampled.mean(), abs=4 * sampled.std() / np.sqrt(count))
+    uncertain = 4 * sampled.std() / np.sqrt(count)
+    assert 2e-4 < (violation > 0).mean() < 0.2
+    assert penalty.mean() > 2 * uncertain, "without the penalty the test would not fail"
+    value = operator(plant=plant).values(state, ACTION, GRID, np.zeros(GRID.size))[0]
+    assert value == pytest.approx(sampled.mean(), abs=uncertain)
 
 
 def test_penalty_needs_and_has_more_nodes_than_the_smooth_part():

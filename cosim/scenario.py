@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosim.errors import ScenarioError
 from cosim.files import read_toml
+from cosim.modules import import_from
 from cosim.result import Shown
 from cosim.validation import suggestion, validated
 
@@ -506,6 +507,8 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
         )
     document = read_toml(path, origin, ScenarioError)
     where = path.resolve()
+    if path.parent != PRESETS:
+        import_from(where.parent)  # its `module:factory` may lie beside it
     return resolved(document, origin, where.parent, (*seen, str(where))), origin
 
 

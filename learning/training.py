@@ -24,8 +24,9 @@ from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.errors import CapabilityError
 from cosim.files import check_target, write_atomically
+from cosim.identity import depends_on
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller, depends_on
+from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller, Plant
 from cosim.result import Result, csv_text
 from cosim.scenario import Scenario

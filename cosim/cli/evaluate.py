@@ -45,7 +45,7 @@ def evaluate(
 
         from cosim.evaluation import named_controllers
 
-        task = cli.load_scenario(scenario)
+        task = cosim.Scenario.load(scenario)
         if trajectories is not None:
             _judge(task, trajectories, cli.open_folder(out), out_)
             return

@@ -36,7 +36,7 @@ def optimum(
     with cli.output(json) as out_:
         from controllers.optimum import QuasiStaticPolicy, change_of
 
-        task = cli.load_scenario(scenario)
+        task = cosim.Scenario.load(scenario)
         if change_of(task) is not None:
             policy = QuasiStaticPolicy.from_scenario(task, progress=_told(out_))
             _show_quasi_static(policy, task, out_)
@@ -130,7 +130,7 @@ def tuning(
         from controllers.factories import value_offset
         from controllers.problem import Problem
 
-        task = cli.load_scenario(scenario)
+        task = cosim.Scenario.load(scenario)
         problem = Problem.from_scenario(task)
         result = tune(problem)
         parameters = result.parameters.replace({"c_lambda": value_offset(task, problem)})

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 import typer
 
-import cosim
 from cosim.errors import CosimError
 from cosim.files import write_atomically
 from cosim.processes import Terminated, hold, redirected_output, release, watch
@@ -212,15 +211,3 @@ def writable_folder(folder: Path) -> Path:
         reason = getattr(error, "strerror", None) or error
         raise CosimError(f"cannot write to folder '{folder}': {reason}") from None
     return folder
-
-
-def load_scenario(name: str) -> cosim.Scenario:
-    """Load a preset or TOML file, so that its `module:function` may lie beside it or here.
-
-    Raises ScenarioError.
-    """
-    from cosim.plugins import import_from
-
-    if Path(name).is_file():
-        import_from(Path(name).resolve().parent)
-    return cosim.Scenario.load(name)

@@ -45,7 +45,7 @@ def simulate(
         from cosim.plugins import parameters_hash
         from cosim.simulation import functions_of
 
-        loaded = cli.load_scenario(scenario)
+        loaded = cosim.Scenario.load(scenario)
         folder = cli.open_folder(out)
         out_.announce(loaded.plant.fmu)
         recorder = None

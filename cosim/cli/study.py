@@ -125,7 +125,8 @@ def report(
 
 def _summary(found: cosim.StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is timing.csv by run."""
-    from cosim.studies.run import TIMING, read_table
+    from cosim.evaluation import TIMING
+    from cosim.studies.run import read_table
 
     timing = read_table(found.folder / TIMING, needed=["run"])
     return {

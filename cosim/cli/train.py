@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
 from cosim.errors import CosimError
 
@@ -78,7 +79,7 @@ def train(
             return
         settings = found.Configuration.from_assignments(assignments or [])
         options = {name: given[name] for name in OPTIONS}
-        run = prepare(algorithm, cli.load_scenario(scenario), samples, settings, options)
+        run = prepare(algorithm, cosim.Scenario.load(scenario), samples, settings, options)
         folder = cli.open_folder(out)
         there = [name for name in FILES if (folder / name).exists()]
         if there and not (resume or overwrite):

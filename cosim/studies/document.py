@@ -157,6 +157,8 @@ class StudyTable(Table):
     """Heading of the report; the name, if left out."""
     description: str = ""
     """A paragraph for readers."""
+    depends_on: list[Source] = []
+    """Data files that plug-ins read, relative to the study's file: edited, their runs are anew."""
     scenarios: Annotated[list[Source], Field(min_length=1)]
     """Presets, scenario files, or names of the file's own `[[scenario]]` tables."""
     scenario: list[dict[str, Any]] = []

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
+from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
@@ -27,12 +28,9 @@ from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
 from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
 from cosim.studies.run import (
-    EVALUATION,
     GREEDY,
     INDICATORS,
     LOG,
-    TIMING,
-    Report,
     Runner,
     RunStore,
     read_table,
@@ -582,14 +580,14 @@ def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
         if run.training is not None:
             log = read_table(store.folder / LOG).assign(**key)
             parts[CURVES].append(log)
-            parts[OPERATION] += [log] if run.marks else []
+            parts[OPERATION] += [log] if run.training.marks else []
         online = []
         for file, noise in run.noise.items():
             if noise.whole:
                 continue
             rows = store.measured(file).rename_axis("seed").reset_index()
-            if noise.mark:
-                parts[GREEDY].append(rows.assign(**key, samples=noise.mark))
+            if (mark := run.marks.get(file)) is not None:
+                parts[GREEDY].append(rows.assign(**key, samples=mark))
             elif file == GREEDY:
                 mean = key | {"greedy_J": float(rows.J.mean())}
                 parts[CURVES].append(pd.DataFrame([mean]))
@@ -666,7 +664,7 @@ def study(
     *,
     jobs: int = 1,
     scheduler: str | None = None,
-    progress: Report | bool = False,
+    progress: Progress | bool = False,
     planned: Plan | None = None,
     figures: bool = True,
 ) -> StudyResults:
@@ -679,8 +677,8 @@ def study(
         source: a study, its file, or the same document as a mapping.
         jobs: worker processes; 1 works in this process. No byte of a table depends on it.
         scheduler: address of a Dask scheduler, used in place of `jobs`.
-        progress: a `Report`, called after every work item, and with a line for each run that ends;
-            True draws a bar.
+        progress: a `Progress`, called after every work item, and with a line for each run that
+            ends; True draws a bar.
         planned: the study's plan, if it is known.
         figures: whether the study's trajectories and logs are drawn.
     """
@@ -690,7 +688,7 @@ def study(
     folder.mkdir(parents=True, exist_ok=True)
     planned = planned or plan(definition)
     with reporting(progress, definition.name, planned.samples) as report:
-        runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
+        runner = Runner(planned.runs, folder, report)
         for line in runner.remarks:
             report(0, "", line)
         runner.run(jobs, scheduler)

@@ -13,6 +13,7 @@ import pandas as pd
 from pydantic import Field
 
 from cosim.errors import ResultsError
+from cosim.evaluation import EVALUATION, TIMING
 from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
 from cosim.studies.document import StudyTable
@@ -20,7 +21,7 @@ from cosim.studies.document import read as read_study
 from cosim.studies.plan import LOGS, TRAJECTORIES
 from cosim.studies.report import rendered
 from cosim.studies.results import ABOUT, CURVES, KEYS, StudyResults
-from cosim.studies.run import EVALUATION, RUNS, TIMING, to_csv
+from cosim.studies.run import RUNS, to_csv
 from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8

@@ -387,29 +387,63 @@ class _Recorded:
 
 
 def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
-    """A row of indicators for each ``*.csv`` of a folder, whose name ends in the run's seed.
+    """Indicators of runs that another tool made, each played back on its seed's noise.
 
     A file has a column for each state and action of the scenario by name (a unit in brackets may
     follow) and a row a sample: the state, and the action then applied. The actions are played back
     on the seed's noise, and the file's states are checked against it; the figures are those of the
-    playback. Columns `file`, `scenario` and its hash, `seed`, `steps`, `indicators`', and `optimum`
-    and `regret`, J of the stored optimum on the same noise, NaN without one. Raises EvaluationError
-    with file, sample and both values.
+    playback.
+
+    Args:
+        scenario: what the runs are of.
+        folder: holds a ``*.csv`` for each run, whose name ends in the run's seed.
+
+    Returns:
+        A row for each run: `file`, `scenario` and its hash, `seed`, `steps`, `indicators`', and
+        `optimum` and `regret`, J of the stored optimum on the same noise, NaN without one.
+
+    Raises:
+        EvaluationError: a file is no trajectory or of other noise, with file, sample and both
+            values; two files are of one seed or hold one run; or runs differ in length.
     """
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise EvaluationError(f"'{folder}' holds no .csv file")
+    runs = {path: _read(path, scenario) for path in paths}
+    _check_seeds_and_lengths(runs)
     best, rows = stored_optimum(scenario), []
     optimum = None if best is None else build_controller(best, scenario)
+    played: dict[bytes, Path] = {}
+    kinds = scenario.plant
+    names = (*kinds.states, *kinds.actions, *kinds.disturbances, "stage_cost")
     with FmuPlant(scenario) as plant:
-        for path in paths:
-            seed, recorded, steps = _read(path, scenario)
+        for path, (seed, recorded, steps) in runs.items():
+            run = simulate(plant, recorded, steps, seed, residuals=False)
+            content = b"".join(run[name].tobytes() for name in names)
+            other = played.setdefault(content, path)
+            if other != path:
+                raise EvaluationError(f"'{path}' holds the same run as '{other}': give it once")
             row: dict[str, Any] = {"file": path.name, "scenario": scenario.name}
             row |= {"scenario_hash": scenario.hash, "seed": seed, "steps": steps}
-            row |= indicators(simulate(plant, recorded, steps, seed, residuals=False))
             cost = np.nan if optimum is None else measure(plant, optimum, seed, steps)[0]["J"]
-            rows.append(row | {"optimum": cost, "regret": row["J"] / cost - 1})
-    return pd.DataFrame(rows).sort_values("seed", ignore_index=True)
+            rows.append(row | indicators(run) | {"optimum": cost})
+    table = pd.DataFrame(rows).sort_values("seed", ignore_index=True)
+    table["regret"] = statistics.regrets(table.J.to_numpy(), table.optimum.to_numpy())
+    return table
+
+
+def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) -> None:
+    """Refuse runs whose mean would count a seed twice or short runs like long ones."""
+    seeds: dict[int, Path] = {}
+    first = next(iter(runs))
+    for path, (seed, _, steps) in runs.items():
+        if (other := seeds.setdefault(seed, path)) != path:
+            raise EvaluationError(f"'{path}' and '{other}' are both of seed {seed}: give one")
+        if steps != runs[first][2]:
+            raise EvaluationError(
+                f"'{path}' has {steps} samples, '{first}' {runs[first][2]}: runs that are "
+                "averaged must have the same length; cut them, or judge them in two folders"
+            )
 
 
 def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
@@ -417,15 +451,20 @@ def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
     if number is None:
         raise EvaluationError(f"'{path}': a file's name ends in its seed, as run-7.csv")
     try:
-        table = pd.read_csv(path)
+        table = pd.read_csv(path, index_col=False)
         table = table.rename(columns=lambda title: title.partition(" [")[0].strip())
         plant = scenario.plant
         numbers = table[[*plant.states, *plant.actions]].astype(float)
-    except (OSError, ValueError, KeyError) as error:
-        raise EvaluationError(f"'{path}' is no trajectory: {error}") from None
+        if numbers.shape[1] != len(plant.states) + len(plant.actions):
+            raise ValueError("two columns have one name")
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        said = " ".join(str(error).split())
+        raise EvaluationError(f"'{path}' is no trajectory: {said}") from None
     actions = numbers[list(plant.actions)].to_numpy()
     inside = (actions >= scenario.action_lower) & (actions <= scenario.action_upper)
     if not len(actions) or not inside.all():
         k = 0 if not len(actions) else int(np.argmin(inside.all(axis=1)))
         raise EvaluationError(f"'{path}': the action at sample {k} is missing or beyond its bounds")
-    return int(number[1]), _Recorded(path, numbers[list(plant.states)], actions), len(actions)
+    if (seed := int(number[1])) >= 1 << 64:
+        raise EvaluationError(f"'{path}': its seed must be below 2⁶⁴")
+    return seed, _Recorded(path, numbers[list(plant.states)], actions), len(actions)

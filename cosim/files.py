@@ -118,33 +118,34 @@ def staged(folder: str | Path, owned: Iterable[str] = ()) -> Iterator[Path]:
 
 
 def _exchange(new: Path, old: Path, folder: Path, owned: Iterable[str]) -> None:
-    """Move the files of `new` to a folder, those that they replace to `old`; all or none."""
+    """Move files of `new` to a folder, and the owned ones that it lacks to `old`; all or none."""
     names = [path.relative_to(new) for path in sorted(new.rglob("*")) if path.is_file()]
-    for name in names:
-        check_target(folder / name)
-        with (new / name).open("rb+") as stream:
-            os.fsync(stream.fileno())
     earlier = {path.relative_to(folder) for pattern in owned for path in folder.glob(pattern)}
-    leaving = sorted({*names, *earlier})
-    for name in leaving:
+    leaving = sorted(earlier - set(names))
+    for name in [*names, *leaving]:
+        check_target(folder / name)
         for root in (old, folder):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        with (new / name).open("rb+") as stream:
+            os.fsync(stream.fileno())
+        if (folder / name).exists():
+            shutil.copy2(folder / name, old / name)
     moved: list[tuple[Path, Path]] = []
     with without_signals():
         try:
-            for name in leaving:
-                if (folder / name).exists():
-                    (folder / name).replace(old / name)
-                    moved.append((old / name, folder / name))
             for name in names:
                 (new / name).replace(folder / name)
-                moved.append((new / name, folder / name))
+                moved.append((old / name, folder / name))
+            for name in leaving:
+                (folder / name).replace(old / name)
+                moved.append((old / name, folder / name))
         except OSError:
-            for before, now in reversed(moved):
-                if before.is_relative_to(new):
-                    now.replace(before)
-                else:
+            for before, now in moved:
+                if before.exists():
                     before.replace(now)
+                else:
+                    now.unlink()
             raise
 
 

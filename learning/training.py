@@ -23,7 +23,7 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.errors import CapabilityError
-from cosim.files import check_target, write_atomically
+from cosim.files import check_target, staged, write_atomically
 from cosim.identity import depends_on
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
@@ -90,6 +90,11 @@ class TrainingRun:
         for name, least in LEAST.items():
             if (value := getattr(self, name)) is not None and value < least:
                 raise ConfigurationError(f"{name} must be at least {least}, not {value}")
+        if self.seed >= HELD_OUT:
+            raise ConfigurationError(
+                f"seed must be below {HELD_OUT}, not {self.seed}: the noise from there on is held "
+                "out, to evaluate what was learned"
+            )
         for name in EVERY[1:]:
             if getattr(self, name) % self.log_every:
                 raise ConfigurationError(
@@ -210,6 +215,11 @@ def starting_parameters(
 
 CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
+FILES = (
+    CHECKPOINT, LOG, PARAMETERS, FIGURE, "learning.gif", "summary.json", "scenario.toml",
+    "training.rrd",
+)  # fmt: skip
+"""Files of a training; all in a folder belong to one run."""
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 FIGURES = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
@@ -409,13 +419,16 @@ class Training(Result):
 
     def save(self, folder: str | Path) -> Path:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        with staged(folder) as stage:
+            self.write_files(stage)
+        return Path(folder)
+
+    def write_files(self, folder: Path) -> None:
+        """Write the files of `save` one after the other."""
         write_atomically(folder / LOG, to_csv(self.rows))
         self.parameters.save(folder / PARAMETERS)
         write_atomically(folder / "scenario.toml", self.run.scenario.to_toml())
         self.plot(folder / FIGURE)
-        return folder
 
     def summary(self) -> dict[str, Any]:
         """The training as a JSON document: settings, the greedy policy's figures, how it ended."""
@@ -649,8 +662,14 @@ class _Session:
         self.loop.restart()
         if self.out is None:
             return
-        write_atomically(self.out / LOG, to_csv(self.rows))
-        self.loop.parameters.save(self.out / PARAMETERS)
+        # Nothing of another run may stay beside the files of this one.
+        with staged(self.out, FILES) as stage:
+            write_atomically(stage / LOG, to_csv(self.rows))
+            self.loop.parameters.save(stage / PARAMETERS)
+            self._save_state(stage / CHECKPOINT)
+
+    def _save_state(self, path: Path) -> None:
+        """Write what resuming needs, where the plant can say its state."""
         try:
             plant = self.plant.serialise(self.plant.snapshot())
             state = self.loop.state()
@@ -662,7 +681,7 @@ class _Session:
             "rows": [[*row.values()] for row in self.rows],
             "row_thetas": np.array([row.parameters.theta for row in self.rows]),
         }
-        checkpoint.save(self.out / CHECKPOINT, self.identity, state)
+        checkpoint.save(path, self.identity, state)
 
     def load(self) -> None:
         """Load the folder's checkpoint; raises CheckpointError if none fits."""

@@ -97,15 +97,12 @@ class Output:
                 table.add_row(*(escape(row[k]) for k in part))
             console.print(table)
 
-    def json(self, document: Mapping[str, Any], folder: Path | None = None) -> None:
-        """Print the document if JSON was asked for; with a folder, write its summary.json too."""
-        text = dump(document) if self.as_json or folder else ""
-        if folder is not None:
-            write_atomically(folder / "summary.json", text)
+    def json(self, document: Mapping[str, Any]) -> None:
+        """Print the document if JSON was asked for."""
         if self.as_json and self._stdout is not None:
-            os.write(self._stdout, text.encode())
+            os.write(self._stdout, dump(document).encode())
         elif self.as_json:
-            sys.stdout.write(text)
+            sys.stdout.write(dump(document))
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""
@@ -181,6 +178,11 @@ def followed(out: Output, label: str, samples: int) -> Iterator[Callable[[int, s
                 out.note(f"{runs}  {line}".strip())
 
         yield report
+
+
+def write_summary(folder: Path, document: Mapping[str, Any]) -> None:
+    """Write summary.json."""
+    write_atomically(folder / "summary.json", dump(document))
 
 
 def dump(document: Mapping[str, Any]) -> str:

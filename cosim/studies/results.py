@@ -19,7 +19,8 @@ from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
 from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import Dots, Look, palette, save_set
-from cosim.files import read_json, write_atomically
+from cosim.files import read_json, staged, write_atomically
+from cosim.processes import holding
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
 from cosim.simulation import reporting
@@ -43,6 +44,8 @@ from cosim.validation import instead, known_keywords
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
 TABLES, OPERATION = (RUNS, EVALUATION, CURVES), "operation.csv"
+FILES = (*TABLES, SUMMARY, AGGREGATE, OPERATION, GREEDY, TIMING, ABOUT, "summary.json")
+"""Files beside those of the runs; all in a folder belong to one study."""
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]
@@ -132,9 +135,11 @@ class StudyResults(Shown):
         tables |= {RUNS: found.runs, SUMMARY: found.summary, TIMING: _timing(stores)}
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
-        for name, table in tables.items():
-            write_atomically(out / name, to_csv(table))
-        write_atomically(out / ABOUT, json.dumps(about, indent=1, sort_keys=True) + "\n")
+        with staged(out, FILES) as stage:
+            for name, table in tables.items():
+                (stage / name).write_text(to_csv(table), "utf-8")
+            text = json.dumps(about, indent=1, sort_keys=True) + "\n"
+            (stage / ABOUT).write_text(text, "utf-8")
         return found
 
     @property
@@ -685,15 +690,14 @@ def study(
     if isinstance(source, Mapping):
         source = Study.from_dict(source)
     definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
     planned = planned or plan(definition)
-    with reporting(progress, definition.name, planned.samples) as report:
+    with holding(folder), reporting(progress, definition.name, planned.samples) as report:
         runner = Runner(planned.runs, folder, report)
         for line in runner.remarks:
             report(0, "", line)
         runner.run(jobs, scheduler)
-    stores = runner.stores.values()
-    results = StudyResults.written(planned, folder, stores, draw=figures)
+        stores = runner.stores.values()
+        results = StudyResults.written(planned, folder, stores, draw=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
         others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import ControllerLookupError
-from cosim.modules import OURS, ROOT, TARGET, code_of, load_plugin
+from cosim.modules import OURS, ROOT, TARGET, code_of, forget_users_modules, load_plugin
 from cosim.plant.fmi import unpack
 from cosim.plugins import ALGORITHMS, CONTROLLERS, registered
 from cosim.scenario import Scenario
@@ -21,6 +21,9 @@ DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "s
 SUFFIXES = (".py", ".toml", ".fmu", ".npz", ".c", ".h", ".in")
 ASIDE = {"cli", "figures", "recording", "results", "__pycache__", "report.py", "figures.py"}
 """Files and folders that bear on no number; `results` is in a wheel only."""
+
+_data: dict[str, str] = {}
+"""Hashes of data files as this process has seen them last, by path."""
 
 
 def depends_on(
@@ -42,15 +45,18 @@ def depends_on(
         ControllerLookupError: a part cannot be imported.
         PlantError: the FMU cannot be read.
     """
+    data = {name: file_hash(path) or "no file" for name, path in (files or {}).items()}
+    for name, path in (files or {}).items():
+        if _data.setdefault(str(path), data[name]) != data[name]:
+            _data[str(path)] = data[name]
+            forget_users_modules()  # they may have read it while they were imported
     found = {"versions": versions(), "rti-cosim": code_hash(), "scenario": scenario.hash}
     found["fmu"] = unpack(scenario.plant.fmu).sha256
     for part in (scenario.controller.model, scenario.plant.model, *parts):
         for module in _modules_of(part):
             if (code := code_of(module)) is not None:
                 found[f"plug-in {module}"] = code
-    for name, path in (files or {}).items():
-        found[name] = file_hash(path) or "no file"
-    return found
+    return found | data
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -178,12 +178,21 @@ def _place(module: str) -> Path | None:
 def _forget_edited_modules() -> None:
     """Remove the modules of places whose sources have changed since, so that they load anew."""
     for place, code in list(_loaded.items()):
-        if _sources_hash(place) == code:
-            continue
-        del _loaded[place]
-        for name in list(sys.modules):
-            if name.partition(".")[0] not in OURS and _place(name) == place:
-                del sys.modules[name]
+        if _sources_hash(place) != code:
+            _forget(place)
+
+
+def forget_users_modules() -> None:
+    """Remove all modules of users, so that they load anew and read their data files again."""
+    for place in list(_loaded):
+        _forget(place)
+
+
+def _forget(place: Path) -> None:
+    del _loaded[place]
+    for name in list(sys.modules):
+        if name.partition(".")[0] not in OURS and _place(name) == place:
+            del sys.modules[name]
 
 
 def _others_of_that_name(module: str) -> list[Path]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -25,7 +26,7 @@ from cosim.protocols import Array, Decision
 from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, reporting, simulate
-from cosim.validation import instead, known_keywords
+from cosim.validation import instead, known_keywords, whole_number
 from cosim.workers import Conditions, Failure, done
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ NAIVE, OPTIMAL = "naive", "optimal"
 EVALUATION, TIMING = "evaluation.csv", "timing.csv"
 FILES = (EVALUATION, TIMING, "evaluation.png", "scenario.toml", "summary.json", "judged.csv")
 """Files of an evaluation; all in a folder belong to one."""
+MOST_SEEDS = 1_000_000
 Progress = Callable[[int, str, str], None]
 """Called with the plant samples done, what is done in words, and a line about an event, or ""."""
 
@@ -89,9 +91,10 @@ def evaluate(
             controller raises.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
-    numbers = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
+    numbers = _numbers(seeds)
+    steps = whole_number("steps", steps, 1, EvaluationError)
     named = named_controllers(controllers)
-    _check(named, numbers, steps)
+    _check(named, numbers)
     wanted = list(named)
     if OPTIMAL not in named and (optimum := stored_optimum(scenario)) is not None:
         named[OPTIMAL] = optimum
@@ -164,11 +167,19 @@ def named_controllers(
 ) -> dict[str, Factory | str]:
     """Controllers by name from SPEC or NAME=SPEC; raises EvaluationError if invalid."""
     if isinstance(controllers, Mapping):
+        for name, given in controllers.items():
+            if not isinstance(name, str) or not (isinstance(given, str) or callable(given)):
+                raise EvaluationError(
+                    f"controllers: '{name}' must be a name or a factory(scenario), not "
+                    f"a {type(given).__name__}"
+                )
         return dict(controllers)
-    if isinstance(controllers, str):
-        raise EvaluationError("controllers must be a list of names, or a mapping, not a text")
+    if isinstance(controllers, str) or not isinstance(controllers, Sequence):
+        raise EvaluationError("controllers must be a list of names, or a mapping")
     named: dict[str, Factory | str] = {}
     for item in controllers:
+        if not isinstance(item, str):
+            raise EvaluationError(f"controllers: a {type(item).__name__} is no name")
         name, equals, text = (part.strip() for part in item.partition("="))
         source = text if equals else name
         name = Path(name).stem if name.endswith(".toml") else name
@@ -180,7 +191,17 @@ def named_controllers(
     return named
 
 
-def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps: int) -> None:
+def _numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
+    """Seeds as integers; raises EvaluationError where they are none."""
+    if not isinstance(seeds, Iterable) or isinstance(seeds, str | bytes | Mapping):
+        count = whole_number("seeds", seeds, 1, EvaluationError)
+        if count > MOST_SEEDS:
+            raise EvaluationError(f"seeds must be at most {MOST_SEEDS}, not {count}")
+        return tuple(range(count))
+    return tuple(whole_number("a seed", seed, 0, EvaluationError) for seed in seeds)
+
+
+def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int]) -> None:
     if not controllers:
         raise EvaluationError("no controller to evaluate")
     own = controllers.get(OPTIMAL, OPTIMAL)
@@ -188,12 +209,10 @@ def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps
         raise EvaluationError(f"'{OPTIMAL}' names the controller that gives J*, not '{own}'")
     if not seeds:
         raise EvaluationError("no seed to evaluate on; give at least one")
-    if len(set(seeds)) < len(seeds) or min(seeds) < 0:
-        raise EvaluationError("seeds must be distinct and not negative")
+    if len(set(seeds)) < len(seeds):
+        raise EvaluationError("seeds must be distinct")
     if max(seeds) >= 1 << 64:
         raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
-    if steps < 1:
-        raise EvaluationError(f"steps must be at least 1, not {steps}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -451,13 +470,15 @@ def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
     if number is None:
         raise EvaluationError(f"'{path}': a file's name ends in its seed, as run-7.csv")
     try:
-        table = pd.read_csv(path, index_col=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # rows of unlike length
+            table = pd.read_csv(path, index_col=False)
         table = table.rename(columns=lambda title: title.partition(" [")[0].strip())
         plant = scenario.plant
         numbers = table[[*plant.states, *plant.actions]].astype(float)
         if numbers.shape[1] != len(plant.states) + len(plant.actions):
             raise ValueError("two columns have one name")
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, Warning) as error:
         said = " ".join(str(error).split())
         raise EvaluationError(f"'{path}' is no trajectory: {said}") from None
     actions = numbers[list(plant.actions)].to_numpy()

@@ -495,6 +495,10 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     `seen` are the files that led here. An FMU's relative path is made absolute, as seen from the
     file that names it. Raises ScenarioError.
     """
+    if not isinstance(source, str | Path):
+        raise ScenarioError(
+            f"a scenario is a preset's name or a path, not a {type(source).__name__}"
+        )
     path, origin = Path(source), f"scenario file '{source}'"
     if (drawn := RANDOM.fullmatch(str(source))) is not None:
         return read("paper")[0] | random_plant(int(drawn[1])), f"preset '{source}'"
@@ -529,6 +533,8 @@ def resolved(
         raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
     if base not in presets() and not RANDOM.fullmatch(base):
         base = str(folder / base)
+    if "\0" in base:
+        raise ScenarioError(f"{origin}: extends must not hold a null byte")
     if str(Path(base).resolve()) in seen:
         raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
     return merged(read(base, seen)[0], result)

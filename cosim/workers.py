@@ -23,6 +23,7 @@ from cosim.identity import changed, depends_on
 from cosim.modules import OURS, import_folders, import_from
 from cosim.processes import Terminated, follow_parent, without_interrupts
 from cosim.scenario import Scenario, is_file
+from cosim.validation import whole_number
 
 ANSWER_SECONDS = 10.0
 """Time in which a scheduler answers."""
@@ -158,8 +159,7 @@ def done(
     Raises:
         EvaluationError: no worker can work.
     """
-    if jobs < 1:
-        raise EvaluationError(f"jobs must be at least 1, not {jobs}")
+    jobs = whole_number("jobs", jobs, 1, EvaluationError)
     left, fruitless = dict(items), 0
     while left:
         fruitless += 1

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from functools import reduce
 from importlib.metadata import version
 from math import gcd, inf, isfinite, isnan
+from numbers import Integral, Real
 from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -37,7 +38,7 @@ from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Strategy, TrainingLoop, Update, load_algorithm
 from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
-from learning.errors import ConfigurationError, DivergenceError
+from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.step import smallest_eigenvalue
 
 if TYPE_CHECKING:
@@ -141,6 +142,9 @@ def prepare(
     for name in options:
         if name not in OPTIONS:
             raise ConfigurationError(f"training has no option '{name}'{suggestion(name, OPTIONS)}")
+    _check_kinds({"samples": samples, **options})
+    if settings is not None and not isinstance(settings, Configuration | Mapping):
+        raise ConfigurationError(f"settings must be a table, not a {type(settings).__name__}")
     if not isinstance(settings, Configuration):
         settings = found.Configuration.from_dict(dict(settings or {}))
     # Intervals that are not given are near their defaults and fit the others.
@@ -156,6 +160,25 @@ def prepare(
         configuration=settings,
         **{**options, **dict.fromkeys(EVERY[1:], rows * log), "log_every": log, **given},
     )
+
+
+def _check_kinds(options: Mapping[str, Any]) -> None:
+    """Refuse options of another kind than the fields of `TrainingRun` by ConfigurationError."""
+    optional = {"samples", "rest_after", *EVERY}
+    for name, value in options.items():
+        if value is None and name in optional:
+            continue
+        kind: type = Integral if name in LEAST else Real if name == "divergence" else str
+        if not isinstance(value, kind) or isinstance(value, bool):
+            words = "a text" if kind is str else "a number" if kind is Real else "a whole number"
+            raise ConfigurationError(f"training: {name} must be {words}, not {value!r:.60}")
+    margin, carrier = options.get("divergence", 1.0), options.get("controller", "rti")
+    if not margin >= 1.0 or margin == inf:
+        raise ConfigurationError(f"training: divergence must be at least 1, not {margin}")
+    if carrier not in ("rti", "converged"):
+        raise ConfigurationError(
+            f"training: there is no controller '{carrier}'; there are rti and converged"
+        )
 
 
 def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> TrainingLoop:
@@ -687,10 +710,17 @@ class _Session:
         """Load the folder's checkpoint; raises CheckpointError if none fits."""
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
-        state = checkpoint.load(self.out / CHECKPOINT, self.identity)
-        self.rows = [
-            LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
-            for figures, theta in zip(state["rows"], state["row_thetas"], strict=True)
-        ]
-        self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
-        self.loop.restore(state)
+        state = checkpoint.load(path := self.out / CHECKPOINT, self.identity)
+        try:
+            self.rows = [
+                LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
+                for figures, theta in zip(state["rows"], state["row_thetas"], strict=True)
+            ]
+            self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
+            self.loop.restore(state)
+        except Exception as error:  # whatever arrays of other names, shapes or kinds lead to
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            raise CheckpointError(
+                f"{path}: the checkpoint does not hold the state of this run ({said}); begin anew "
+                "by --overwrite"
+            ) from error

@@ -19,7 +19,7 @@ Source = Annotated[str, Field(min_length=1)]
 PerScenario = Count | dict[str, Count]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""
 DEFAULT = "default"
-Hour = Annotated[float, Field(gt=0.0)]
+Hour = Annotated[float, Field(gt=0.0, le=1e6)]
 Hours = Annotated[list[Hour], Field(min_length=1)]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -41,6 +41,8 @@ TRAJECTORIES, LOGS = "trajectories", "logs"
 """Folders of what a study keeps of its runs."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
+MOST_SAMPLES = 100_000_000
+"""Samples of the longest run."""
 T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
 
@@ -255,10 +257,16 @@ class Study:
         hours = self._of(self.table.operation.hours, scenario, "operation.hours")
         return self.samples_of(hours, scenario)
 
-    def samples_of(self, hours: Iterable[float], scenario: str) -> tuple[int, ...]:
+    def samples_of(self, hours: Sequence[float], scenario: str) -> tuple[int, ...]:
         """Hours of operation as samples, increasing."""
         h = self.scenarios[scenario].sampling_time
-        return tuple(sorted({max(1, round(3600.0 * hour / h)) for hour in hours}))
+        samples = sorted({max(1, round(3600.0 * hour / h)) for hour in hours})
+        if samples and samples[-1] > MOST_SAMPLES:
+            raise StudyError(
+                f"operation.hours: {max(hours):g} h are {samples[-1]} samples of '{scenario}'; a "
+                f"run has at most {MOST_SAMPLES}"
+            )
+        return tuple(samples)
 
     def _of(self, value: T | dict[str, T], scenario: str, field: str) -> T:
         if not isinstance(value, dict):

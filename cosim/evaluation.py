@@ -193,7 +193,8 @@ def named_controllers(
 
 def _numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
     """Seeds as integers; raises EvaluationError where they are none."""
-    if not isinstance(seeds, Iterable) or isinstance(seeds, str | bytes | Mapping):
+    several = isinstance(seeds, Iterable) and not isinstance(seeds, str | bytes | Mapping)
+    if not several or getattr(seeds, "ndim", 1) == 0:
         count = whole_number("seeds", seeds, 1, EvaluationError)
         if count > MOST_SEEDS:
             raise EvaluationError(f"seeds must be at most {MOST_SEEDS}, not {count}")

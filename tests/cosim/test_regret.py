@@ -18,7 +18,7 @@ def profit(tmp_path):
     """A scenario whose optimum has a negative J: a stand-in for it has the greater profit."""
     (tmp_path / "profit.toml").write_text(
         'extends = "reactor"\nname = "profit"\n[plant.parameters]\nfixed_cost = 0.0\n'
-        f"[penalty]\nlinear = {[1e-3] * 2}\nquadratic = {[1e-3] * 2}\n"
+        f"[penalty]\nlinear = {[1.0] * 2}\nquadratic = {[1e-3] * 2}\n"
     )
     return tmp_path / "profit.toml"
 

@@ -193,8 +193,8 @@ def named_controllers(
 
 def _numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
     """Seeds as integers; raises EvaluationError where they are none."""
-    several = isinstance(seeds, Iterable) and not isinstance(seeds, str | bytes | Mapping)
-    if not several or getattr(seeds, "ndim", 1) == 0:
+    no_list = isinstance(seeds, str | bytes | Mapping) or getattr(seeds, "ndim", 1) == 0
+    if no_list or not isinstance(seeds, Iterable):
         count = whole_number("seeds", seeds, 1, EvaluationError)
         if count > MOST_SEEDS:
             raise EvaluationError(f"seeds must be at most {MOST_SEEDS}, not {count}")

@@ -55,18 +55,16 @@ def evaluate(
         words += ["--first-seed", str(first_seed)] * (first_seed > 0) + ["--steps", str(steps)]
         folder = cli.open_folder(out)
         out_.announce(task.plant.fmu)
-        total = (len(named) + ("optimal" not in named)) * seeds * steps
-        with cli.followed(out_, f"samples on {task.name}", total) as report:
-            evaluation = cosim.evaluate(
-                task,
-                named,
-                range(first_seed, first_seed + seeds),
-                steps,
-                jobs=jobs or cpu_count(),
-                scheduler=scheduler,
-                progress=report,
-                command=shlex.join(["cosim", "evaluate", *words]),
-            )
+        evaluation = cosim.evaluate(
+            task,
+            named,
+            range(first_seed, first_seed + seeds),
+            steps,
+            jobs=jobs or cpu_count(),
+            scheduler=scheduler,
+            progress=out_.live,
+            command=shlex.join(["cosim", "evaluate", *words]),
+        )
         summary = evaluation.summary()
         with staged(folder, FILES) as stage:
             evaluation.write_files(stage)

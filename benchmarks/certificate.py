@@ -14,11 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from controllers import OptimalPolicy, factories
+from controllers import OptimalPolicy
 from controllers import optimum as store
 from controllers.dynamic_programming import SEARCH, Figure, Settings, objection
 from controllers.problem import PlantProblem
 from cosim.plant import FmuPlant
+from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import indicators_of
 from cosim.statistics import mean
@@ -43,7 +44,7 @@ def main() -> None:
         searched, best = (
             indicators_of(fmu, each, SEEDS, STEPS)["J"]
             for each in (
-                factories.from_file(scenario, chosen.parameters),
+                build_controller(str(chosen.parameters), scenario),
                 OptimalPolicy(plant, found),
             )
         )

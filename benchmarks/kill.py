@@ -139,7 +139,8 @@ def inspect(folder: Path) -> int:
     """How many files there are, hidden ones apart; each is whole, and nobody holds the folder."""
     count = 0
     for path in (folder / "out").rglob("*"):
-        if path.name.startswith(".") or not path.is_file():
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if hidden or not path.is_file():
             continue
         count += 1
         if path.suffix == ".csv":

@@ -22,6 +22,7 @@ from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
+from cosim.statistics import regrets
 from learning import empirical_model, model_based
 from learning.training import TrainingRun, begin, prepare
 
@@ -109,7 +110,7 @@ def main() -> None:
             )
             print(
                 f"{number:6d} {np.mean(costs):11.2f} {J:11.2f} "
-                f"{100 * (J / best[now.hash] - 1):9.2f} {seconds:9.1f} {elapsed:8.1f}  "
+                f"{100 * regrets(J, best[now.hash]):9.2f} {seconds:9.1f} {elapsed:8.1f}  "
                 f"{away.round(3).tolist()}",
                 flush=True,
             )

@@ -19,6 +19,7 @@ from benchmarks.model_based import asked, greedy
 from controllers import compile_functions
 from controllers.factories import nmpc, optimal
 from cosim.plant import FmuPlant
+from cosim.statistics import regrets
 from learning.model_based import BURN, FINE, RECENT, BackOffs, ModelBased
 from learning.step import clip_eigenvalues, smallest_eigenvalue
 from learning.training import begin
@@ -110,7 +111,7 @@ def main() -> None:
     for name, theta in (("model-based", before.theta), ("and the gradient", after)):
         controller.theta = theta
         J = greedy(scenario, controller)
-        print(f"{name}: J {J:.2f}, regret {100 * (J / best - 1):.2f} %", flush=True)
+        print(f"{name}: J {J:.2f}, regret {100 * regrets(J, best):.2f} %", flush=True)
 
 
 if __name__ == "__main__":

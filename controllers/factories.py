@@ -54,9 +54,10 @@ def naive(scenario: Scenario, kind: str = "rti") -> RtiNmpc:
     return nmpc(scenario, found, kind)
 
 
-def from_file(scenario: Scenario, path: str | Path) -> RtiNmpc:
-    """RTI-NMPC with θ from a parameters file."""
-    return nmpc(scenario, Parameters.load(path, Problem.from_scenario(scenario)))
+def from_toml(scenario: Scenario, text: str, path: str | Path, kind: str = "rti") -> RtiNmpc:
+    """NMPC with θ from the text of a parameters file; `path` names it in messages."""
+    found = Parameters.from_toml(text, Problem.from_scenario(scenario), path)
+    return nmpc(scenario, found, kind)
 
 
 def tuned(scenario: Scenario) -> RtiNmpc:

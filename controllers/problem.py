@@ -15,7 +15,7 @@ from controllers.errors import ModelError, OptimumError
 from controllers.integration import Integration, measure_integration
 from controllers.model import Model
 from controllers.qp import FIXED, MEANING, SETTINGS
-from cosim.plugins import exception_line, load_plugin
+from cosim.modules import exception_line, load_plugin
 from cosim.protocols import Matrix, Vector
 from cosim.scenario import Penalty, Scenario
 

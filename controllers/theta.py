@@ -19,7 +19,7 @@ from pydantic import Field
 from controllers.errors import ModelError, ParameterError
 from controllers.functions import consecutive
 from controllers.problem import Problem
-from cosim.files import read_toml, write_atomically
+from cosim.files import parse_toml, read_text, write_atomically
 from cosim.protocols import Vector
 from cosim.result import Shown
 from cosim.scenario import Names, Table
@@ -305,8 +305,15 @@ class Parameters(Shown):
         Raises ParameterError where the file is missing or no TOML, has another schema, key or
         block, or values that do not match its hash.
         """
-        document = read_toml(path, f"parameters file '{path}'", ParameterError)
-        file = validated(_File, document, f"parameters file '{path}'", ParameterError)
+        text = read_text(path, f"parameters file '{path}'", ParameterError)
+        return cls.from_toml(text, problem, path)
+
+    @classmethod
+    def from_toml(cls, text: str, problem: Problem, path: str | Path) -> Parameters:
+        """θ of a file's text, as `load`; `path` names the file in messages."""
+        origin = f"parameters file '{path}'"
+        document = parse_toml(text, origin, ParameterError)
+        file = validated(_File, document, origin, ParameterError)
         values, names = file.theta, file.model_parameters
         slack_weights = "w_sigma" in values or "W_sigma" in values
         try:

@@ -2,7 +2,13 @@
 
 
 class CosimError(Exception):
-    """Base of every error that the four packages raise on bad input or a failed run."""
+    """Base of every error that the four packages raise on bad input or a failed run.
+
+    Its text is one line, whatever a user's name or value in it holds.
+    """
+
+    def __str__(self) -> str:
+        return " ".join(super().__str__().splitlines())
 
 
 class CosimWarning(UserWarning):

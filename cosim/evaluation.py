@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,21 +17,28 @@ import pandas as pd
 from controllers.optimum import stored_optimum
 from cosim import statistics
 from cosim.errors import EvaluationError
-from cosim.files import replacing, temporary_folder
+from cosim.files import staged
+from cosim.measurement import Factory, Measured, MeasureItem, Noise, built
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
-from cosim.protocols import Array, Controller, Decision
+from cosim.plugins import ControllerSource, build_controller, parameters_hash
+from cosim.processes import holding
+from cosim.protocols import Array, Decision
 from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, reporting, simulate
-from cosim.studies.run import EVALUATION, TIMING, Noise, Report, Run, Runner, to_csv
-from cosim.validation import instead, known_keywords
+from cosim.validation import instead, known_keywords, whole_number
+from cosim.workers import Conditions, Failure, done
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAIVE, OPTIMAL = "naive", "optimal"
-Factory = Callable[[Scenario], Controller]
+EVALUATION, TIMING = "evaluation.csv", "timing.csv"
+FILES = (EVALUATION, TIMING, "evaluation.png", "scenario.toml", "summary.json", "judged.csv")
+"""Files of an evaluation; all in a folder belong to one."""
+MOST_SEEDS = 1_000_000
+Progress = Callable[[int, str, str], None]
+"""Called with the plant samples done, what is done in words, and a line about an event, or ""."""
 
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
 COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
@@ -50,80 +60,106 @@ def evaluate(
     folder: str | Path | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
-    progress: Report | bool = False,
+    progress: Progress | bool = False,
     command: str = "cosim.evaluate",
 ) -> Evaluation:
     """Run every controller on every seed; the table is the same for any number of workers.
 
     On a seed all controllers meet the same disturbances (common random numbers). A stored optimum
-    runs too, for J*, without rows of its own unless it is named. Raises EvaluationError on a
-    malformed request or failed workers, StudyError on a name that no folder can have, and what
-    building or running a controller raises.
+    runs too, for J*, without rows of its own unless it is named. Every figure is computed anew.
 
     Args:
+        scenario: a scenario, a preset's name or a TOML file.
         controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
             what `cosim.plugins.build_controller` takes; or only such texts, or `NAME=…`. The
             one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
         seeds: the seeds, or their number S for 0 … S−1.
         steps: samples per run, from the scenario's initial state on.
-        folder: where finished runs are kept and found again; None keeps none.
+        folder: where the tables are written at the end (`Evaluation.write`); None writes none.
         jobs: worker processes; 1 works in this process.
         scheduler: address of a Dask scheduler, used in place of `jobs`.
-        progress: called as `cosim.study` does, with a line on what is done anew; True draws a bar.
+        progress: called as `cosim.study` does; True draws a bar.
         command: the text of the column `command`.
+
+    Returns:
+        Indicators by controller and seed.
+
+    Raises:
+        EvaluationError: the request is malformed, the workers failed, or one of them found other
+            files than were there when the work was given out.
+        CosimError: another process writes to the folder; and what building or running a
+            controller raises.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
-    numbers = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
+    numbers = _numbers(seeds)
+    steps = whole_number("steps", steps, 1, EvaluationError)
     named = named_controllers(controllers)
-    _check(named, numbers, steps)
+    _check(named, numbers)
     wanted = list(named)
     if OPTIMAL not in named and (optimum := stored_optimum(scenario)) is not None:
         named[OPTIMAL] = optimum
-    with FmuPlant(scenario) as plant:
-        fmu = plant.fmu_sha256
-    facts = {
-        "scenario": scenario.name,
-        "steps": steps,
-        "version": versions().partition("rti-cosim ")[2].partition(";")[0],
-        "versions": versions(),
-        "code_hash": code_hash(),
-        "scenario_hash": scenario.hash,
-        "fmu_sha256": fmu,
-        "command": command,
-    }
-    noise = {EVALUATION: Noise(numbers, steps)}
-    runs, parameters = [], {}
-    for name, item in named.items():
-        controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
-        parameters[name] = parameters_hash(controller)
-        depends = depends_on(scenario, item, type(controller)) | {
-            "fmu": fmu,
-            "controller": item if isinstance(item, str) else _qualified(item),
-            "parameters": parameters[name],
-        }
-        runs.append(Run(scenario, name, depends, noise, item))
-    total = sum(run.samples for run in runs)
-    bar = reporting(progress, scenario.name, total)
-    with temporary_folder("cosim-evaluation-") as own, bar as tell:
-        runner = Runner(runs, Path(folder or own), (Path.cwd(),), lambda *at: tell(*at[:2], ""))
-        for line in runner.remarks:
-            tell(0, "", line)
-        runner.run(jobs, scheduler)
-        for failure in runner.failures.values():
-            raise failure.error()
-        stores = dict(zip(named, runner.stores.values(), strict=True))
-        columns, timing = (
-            {name: store.measured(file) for name, store in stores.items()}
-            for file in (EVALUATION, TIMING)
+    with holding(Path(folder)) if folder is not None else nullcontext():
+        evaluation = _evaluated(
+            scenario, named, wanted, Noise(numbers, steps), jobs, scheduler, progress, command
         )
-    return Evaluation(wanted, numbers, columns, timing, parameters, facts)
+        if folder is not None:
+            evaluation.write(folder)
+    return evaluation
 
 
-def _qualified(factory: Factory) -> str:
-    """A factory's name, as far as it has one."""
-    inner = getattr(factory, "func", factory)
-    arguments = f"{getattr(factory, 'args', '')}{getattr(factory, 'keywords', '')}"
-    return f"{inner.__module__}:{getattr(inner, '__qualname__', type(inner).__name__)}{arguments}"
+def _evaluated(
+    scenario: Scenario,
+    named: Mapping[str, Factory | str],
+    wanted: Sequence[str],
+    noise: Noise,
+    jobs: int,
+    scheduler: str | None,
+    progress: Progress | bool,
+    command: str,
+) -> Evaluation:
+    """Measure each of the controllers on the noise; the `wanted` have rows of their own."""
+    items: dict[tuple[str, int], MeasureItem] = {}
+    parameters = {}
+    for name, given in named.items():
+        source = ControllerSource.read(given) if isinstance(given, str) else given
+        conditions = Conditions.of_now(scenario, given)
+        parameters[name] = parameters_hash(built(source, conditions.scenario))
+        whole = MeasureItem(conditions, source, noise, noise.length)
+        items |= {(name, part.noise.seeds[0]): part for part in whole.parts()}
+    facts = conditions.facts
+    measured = {name: Measured() for name in named}
+    done_samples, total = 0, len(named) * noise.samples
+    with reporting(progress, scenario.name, total) as tell:
+        for key, result in done(items, jobs, scheduler):
+            if isinstance(result, Failure):
+                raise result.error()
+            measured[key[0]].indicators |= result.indicators
+            measured[key[0]].timing |= result.timing
+            done_samples += items[key].noise.samples
+            tell(done_samples, f"{done_samples / total:.0%}", "")
+    return Evaluation(
+        scenario=scenario,
+        controllers=wanted,
+        seeds=noise.seeds,
+        columns={name: _frame(found.indicators, noise.seeds) for name, found in measured.items()},
+        timing={name: _frame(found.timing, noise.seeds) for name, found in measured.items()},
+        parameters=parameters,
+        facts={
+            "scenario": scenario.name,
+            "steps": noise.steps,
+            "version": version("rti-cosim"),
+            "versions": facts["versions"],
+            "code_hash": facts["rti-cosim"],
+            "scenario_hash": facts["scenario"],
+            "fmu_sha256": facts["fmu"],
+            "command": command,
+        },
+    )
+
+
+def _frame(rows: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> pd.DataFrame:
+    """Rows by seed as a frame, in the order of the seeds."""
+    return pd.DataFrame.from_dict(rows, "index").reindex(list(seeds))
 
 
 def named_controllers(
@@ -131,11 +167,19 @@ def named_controllers(
 ) -> dict[str, Factory | str]:
     """Controllers by name from SPEC or NAME=SPEC; raises EvaluationError if invalid."""
     if isinstance(controllers, Mapping):
+        for name, given in controllers.items():
+            if not isinstance(name, str) or not (isinstance(given, str) or callable(given)):
+                raise EvaluationError(
+                    f"controllers: '{name}' must be a name or a factory(scenario), not "
+                    f"a {type(given).__name__}"
+                )
         return dict(controllers)
-    if isinstance(controllers, str):
-        raise EvaluationError("controllers must be a list of names, or a mapping, not a text")
+    if isinstance(controllers, str) or not isinstance(controllers, Sequence):
+        raise EvaluationError("controllers must be a list of names, or a mapping")
     named: dict[str, Factory | str] = {}
     for item in controllers:
+        if not isinstance(item, str):
+            raise EvaluationError(f"controllers: a {type(item).__name__} is no name")
         name, equals, text = (part.strip() for part in item.partition("="))
         source = text if equals else name
         name = Path(name).stem if name.endswith(".toml") else name
@@ -147,7 +191,18 @@ def named_controllers(
     return named
 
 
-def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps: int) -> None:
+def _numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
+    """Seeds as integers; raises EvaluationError where they are none."""
+    no_list = isinstance(seeds, str | bytes | Mapping) or getattr(seeds, "ndim", 1) == 0
+    if no_list or not isinstance(seeds, Iterable):
+        count = whole_number("seeds", seeds, 1, EvaluationError)
+        if count > MOST_SEEDS:
+            raise EvaluationError(f"seeds must be at most {MOST_SEEDS}, not {count}")
+        return tuple(range(count))
+    return tuple(whole_number("a seed", seed, 0, EvaluationError) for seed in seeds)
+
+
+def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int]) -> None:
     if not controllers:
         raise EvaluationError("no controller to evaluate")
     own = controllers.get(OPTIMAL, OPTIMAL)
@@ -155,12 +210,10 @@ def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps
         raise EvaluationError(f"'{OPTIMAL}' names the controller that gives J*, not '{own}'")
     if not seeds:
         raise EvaluationError("no seed to evaluate on; give at least one")
-    if len(set(seeds)) < len(seeds) or min(seeds) < 0:
-        raise EvaluationError("seeds must be distinct and not negative")
+    if len(set(seeds)) < len(seeds):
+        raise EvaluationError("seeds must be distinct")
     if max(seeds) >= 1 << 64:
         raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
-    if steps < 1:
-        raise EvaluationError(f"steps must be at least 1, not {steps}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -171,6 +224,7 @@ class Evaluation(Result):
     `parameters` are each controller's hash; `facts` are the columns that do not vary.
     """
 
+    scenario: Scenario
     controllers: Sequence[str]
     seeds: Sequence[int]
     columns: Mapping[str, pd.DataFrame]
@@ -229,7 +283,7 @@ class Evaluation(Result):
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
-        return to_csv(self.to_pandas())
+        return str(self.to_pandas().to_csv(index=False, lineterminator="\n"))
 
     def figure(self) -> Figure:
         """Regret (J where J* is not known) with its intervals; economic cost against violation."""
@@ -249,14 +303,19 @@ class Evaluation(Result):
         rows = means.map("{:.6g}".format).reset_index().to_numpy().tolist()
         return markdown_table(("controller", *names), rows)
 
-    def write(self, folder: Path) -> None:
-        """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""
+    def write(self, folder: str | Path) -> None:
+        """Write evaluation.csv, evaluation.png, timing.csv and scenario.toml, all or none."""
+        with staged(folder, FILES) as stage:
+            self.write_files(stage)
+
+    def write_files(self, folder: Path) -> None:
+        """Write the files of `write` one after the other."""
         self.plot(folder / "evaluation.png")
+        (folder / "scenario.toml").write_text(self.scenario.to_toml(), "utf-8")
         clock = self._rows(self.timing).round(3)
         for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock)):
             # Write row by row: the text of all takes ten times the memory of the numbers.
-            with replacing(folder / name) as path:
-                frame.to_csv(path, index=False, lineterminator="\n")
+            frame.to_csv(folder / name, index=False, lineterminator="\n")
 
     def summary(self) -> dict[str, Any]:
         """The evaluation as a JSON document: controllers, comparisons, provenance, timing.
@@ -348,29 +407,63 @@ class _Recorded:
 
 
 def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
-    """A row of indicators for each ``*.csv`` of a folder, whose name ends in the run's seed.
+    """Indicators of runs that another tool made, each played back on its seed's noise.
 
     A file has a column for each state and action of the scenario by name (a unit in brackets may
     follow) and a row a sample: the state, and the action then applied. The actions are played back
     on the seed's noise, and the file's states are checked against it; the figures are those of the
-    playback. Columns `file`, `scenario` and its hash, `seed`, `steps`, `indicators`', and `optimum`
-    and `regret`, J of the stored optimum on the same noise, NaN without one. Raises EvaluationError
-    with file, sample and both values.
+    playback.
+
+    Args:
+        scenario: what the runs are of.
+        folder: holds a ``*.csv`` for each run, whose name ends in the run's seed.
+
+    Returns:
+        A row for each run: `file`, `scenario` and its hash, `seed`, `steps`, `indicators`', and
+        `optimum` and `regret`, J of the stored optimum on the same noise, NaN without one.
+
+    Raises:
+        EvaluationError: a file is no trajectory or of other noise, with file, sample and both
+            values; two files are of one seed or hold one run; or runs differ in length.
     """
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise EvaluationError(f"'{folder}' holds no .csv file")
+    runs = {path: _read(path, scenario) for path in paths}
+    _check_seeds_and_lengths(runs)
     best, rows = stored_optimum(scenario), []
     optimum = None if best is None else build_controller(best, scenario)
+    played: dict[bytes, Path] = {}
+    kinds = scenario.plant
+    names = (*kinds.states, *kinds.actions, *kinds.disturbances, "stage_cost")
     with FmuPlant(scenario) as plant:
-        for path in paths:
-            seed, recorded, steps = _read(path, scenario)
+        for path, (seed, recorded, steps) in runs.items():
+            run = simulate(plant, recorded, steps, seed, residuals=False)
+            content = b"".join(run[name].tobytes() for name in names)
+            other = played.setdefault(content, path)
+            if other != path:
+                raise EvaluationError(f"'{path}' holds the same run as '{other}': give it once")
             row: dict[str, Any] = {"file": path.name, "scenario": scenario.name}
             row |= {"scenario_hash": scenario.hash, "seed": seed, "steps": steps}
-            row |= indicators(simulate(plant, recorded, steps, seed, residuals=False))
             cost = np.nan if optimum is None else measure(plant, optimum, seed, steps)[0]["J"]
-            rows.append(row | {"optimum": cost, "regret": row["J"] / cost - 1})
-    return pd.DataFrame(rows).sort_values("seed", ignore_index=True)
+            rows.append(row | indicators(run) | {"optimum": cost})
+    table = pd.DataFrame(rows).sort_values("seed", ignore_index=True)
+    table["regret"] = statistics.regrets(table.J.to_numpy(), table.optimum.to_numpy())
+    return table
+
+
+def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) -> None:
+    """Refuse runs whose mean would count a seed twice or short runs like long ones."""
+    seeds: dict[int, Path] = {}
+    first = next(iter(runs))
+    for path, (seed, _, steps) in runs.items():
+        if (other := seeds.setdefault(seed, path)) != path:
+            raise EvaluationError(f"'{path}' and '{other}' are both of seed {seed}: give one")
+        if steps != runs[first][2]:
+            raise EvaluationError(
+                f"'{path}' has {steps} samples, '{first}' {runs[first][2]}: runs that are "
+                "averaged must have the same length; cut them, or judge them in two folders"
+            )
 
 
 def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
@@ -378,15 +471,22 @@ def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
     if number is None:
         raise EvaluationError(f"'{path}': a file's name ends in its seed, as run-7.csv")
     try:
-        table = pd.read_csv(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # rows of unlike length
+            table = pd.read_csv(path, index_col=False)
         table = table.rename(columns=lambda title: title.partition(" [")[0].strip())
         plant = scenario.plant
         numbers = table[[*plant.states, *plant.actions]].astype(float)
-    except (OSError, ValueError, KeyError) as error:
-        raise EvaluationError(f"'{path}' is no trajectory: {error}") from None
+        if numbers.shape[1] != len(plant.states) + len(plant.actions):
+            raise ValueError("two columns have one name")
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, Warning) as error:
+        said = " ".join(str(error).split())
+        raise EvaluationError(f"'{path}' is no trajectory: {said}") from None
     actions = numbers[list(plant.actions)].to_numpy()
     inside = (actions >= scenario.action_lower) & (actions <= scenario.action_upper)
     if not len(actions) or not inside.all():
         k = 0 if not len(actions) else int(np.argmin(inside.all(axis=1)))
         raise EvaluationError(f"'{path}': the action at sample {k} is missing or beyond its bounds")
-    return int(number[1]), _Recorded(path, numbers[list(plant.states)], actions), len(actions)
+    if (seed := int(number[1])) >= 1 << 64:
+        raise EvaluationError(f"'{path}': its seed must be below 2⁶⁴")
+    return seed, _Recorded(path, numbers[list(plant.states)], actions), len(actions)

@@ -8,8 +8,10 @@ import json
 import os
 import secrets
 import shutil
+import signal
 import stat
 import tempfile
+import threading
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 
 # NumPy and filelock are imported where they are needed: `cosim --help` has no use for them.
 
+STAGED = ".cosim-staged-"
+"""Begin of the names of folders in which the files of a run wait for its end."""
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _inputs: set[tuple[int, int]] = set()
 
 
@@ -79,6 +84,88 @@ def publish(temporary: Path, path: Path) -> None:
     with temporary.open("rb+") as stream:
         os.fsync(stream.fileno())
     temporary.replace(path)
+
+
+@contextmanager
+def staged(folder: str | Path, owned: Iterable[str] = ()) -> Iterator[Path]:
+    """Yield an empty folder for all files of a run, which are moved to `folder` after the block.
+
+    They appear together: after a failure or an interruption the files of before are all there, and
+    afterwards none of them is left beside the new ones.
+
+    Args:
+        folder: where the files will be; made if need be.
+        owned: patterns of the names of all files that such a run may write; those that match and
+            that this run has not written are removed.
+
+    Raises:
+        OSError: a file cannot be written or moved, names an input of this command, or would
+            replace what is no regular file.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with temporary_folder(STAGED, folder) as work:
+        new, old = work / "new", work / "old"
+        new.mkdir()
+        old.mkdir()
+        try:
+            yield new
+            _exchange(new, old, folder, owned)
+        except OSError as error:
+            if isinstance(error.filename, str):  # as the user knows it
+                error.filename = error.filename.replace(str(new), str(folder))
+            raise
+
+
+def _exchange(new: Path, old: Path, folder: Path, owned: Iterable[str]) -> None:
+    """Move files of `new` to a folder, and the owned ones that it lacks to `old`; all or none."""
+    names = [path.relative_to(new) for path in sorted(new.rglob("*")) if path.is_file()]
+    earlier = {path.relative_to(folder) for pattern in owned for path in folder.glob(pattern)}
+    leaving = sorted(earlier - set(names))
+    for name in [*names, *leaving]:
+        check_target(folder / name)
+        for root in (old, folder):
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        with (new / name).open("rb+") as stream:
+            os.fsync(stream.fileno())
+        if (folder / name).exists():
+            shutil.copy2(folder / name, old / name)
+    moved: list[tuple[Path, Path]] = []
+    with without_signals():
+        try:
+            for name in names:
+                (new / name).replace(folder / name)
+                moved.append((old / name, folder / name))
+            for name in leaving:
+                (folder / name).replace(old / name)
+                moved.append((old / name, folder / name))
+        except OSError:
+            for before, now in moved:
+                if before.exists():
+                    before.replace(now)
+                else:
+                    now.unlink()
+            raise
+
+
+@contextmanager
+def without_signals() -> Iterator[None]:
+    """Hold back Ctrl-C, SIGTERM and SIGHUP until the end of the block."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread handles signals
+        return
+    numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
+    numbers = [n for n in numbers if signal.getsignal(n) not in (None, signal.SIG_IGN)]
+    caught: list[int] = []
+    before = {n: signal.signal(n, lambda number, _: caught.append(number)) for n in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in caught:
+            signal.raise_signal(number)
 
 
 def write_atomically(path: str | Path, data: bytes | str) -> Path:
@@ -181,33 +268,42 @@ def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str
 
     Raises `error` where there is no such regular file, or where it is not UTF-8 or not TOML.
     """
-    return dict(_parsed(tomllib.loads, "TOML", path, origin, error))
+    return parse_toml(read_text(path, origin, error), origin, error)
 
 
 def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
     """Document of a JSON file, an object; raises `error` as `read_toml` does."""
-    document = _parsed(json.loads, "JSON", path, origin, error)
+    document = _parsed(json.loads, "JSON", read_text(path, origin, error), origin, error)
     if not isinstance(document, dict):
         raise error(f"{origin} is not a JSON object")
     return document
 
 
-def _parsed(
-    parse: Callable[[str], Any], kind: str, path: str | Path, origin: str, error: type[Exception]
-) -> Any:
+def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
+    """Document of a TOML text; `origin` is its name in messages. Raises `error` on other text."""
+    return dict(_parsed(tomllib.loads, "TOML", text, origin, error))
+
+
+def read_text(path: str | Path, origin: str, error: type[Exception]) -> str:
+    """Text of a UTF-8 file; raises `error` where there is no such regular file, or other bytes."""
     try:
         if Path(path).exists() and not Path(path).is_file():
             raise error(f"{origin} is not a regular file")
-        content = Path(path).read_bytes()
+        return Path(path).read_bytes().decode("utf-8")
     except FileNotFoundError:
         raise error(f"{origin} does not exist") from None
+    except UnicodeDecodeError:
+        raise error(f"{origin} is not UTF-8 text") from None
     except (OSError, ValueError) as cause:
         reason = getattr(cause, "strerror", None) or cause
         raise error(f"{origin} cannot be read: {reason}") from None
+
+
+def _parsed(
+    parse: Callable[[str], Any], kind: str, text: str, origin: str, error: type[Exception]
+) -> Any:
     try:
-        return parse(content.decode("utf-8"))
-    except UnicodeDecodeError:
-        raise error(f"{origin} is not UTF-8 text") from None
+        return parse(text)
     # Nesting without end exhausts the parser's stack, a number without end Python's patience.
     except (ValueError, RecursionError) as cause:
         raise error(f"{origin} is not valid {kind}: {cause}") from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,7 +18,7 @@ from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from cosim.errors import CosimError, PlantError
-from cosim.files import lock, temporary_folder, write_atomically
+from cosim.files import STAGED, lock, temporary_folder, write_atomically
 
 # psutil and filelock are imported where they are needed: every command imports this file.
 if TYPE_CHECKING:
@@ -195,23 +196,42 @@ def hold(folder: Path) -> None:
         raise CosimError(
             f"folder '{folder}' is being written by {who}; wait for it or choose another --out"
         ) from None
+    for left in folder.glob(f"{STAGED}*"):  # by a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
     since = datetime.now(UTC).isoformat(timespec="seconds")
     command = " ".join(["cosim", *sys.argv[1:]])
     holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
     write_atomically(folder / HOLDER, holder.encode("utf-8", "backslashreplace"))
 
 
+@contextmanager
+def holding(folder: Path) -> Iterator[None]:
+    """Hold a folder, made if need be, during the block, as `hold` does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ours = folder.resolve() not in _held
+    hold(folder)
+    try:
+        yield
+    finally:
+        if ours:
+            _release(folder.resolve())
+
+
 def release() -> list[Path]:
     """Release every lock of this process and remove its files; returns the folders."""
     folders = list(_held)
-    while _held:
-        folder, held = _held.popitem()
-        # Remove it while it is held: another process then makes another file.
-        for name in (HOLDER, LOCK):
-            with suppress(OSError):
-                (folder / name).unlink()
-        held.release()
+    for folder in folders:
+        _release(folder)
     return folders
+
+
+def _release(folder: Path) -> None:
+    held = _held.pop(folder)
+    # Remove it while it is held: another process then makes another file.
+    for name in (HOLDER, LOCK):
+        with suppress(OSError):
+            (folder / name).unlink()
+    held.release()
 
 
 _stdout: list[int] = []

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosim.errors import ScenarioError
 from cosim.files import read_toml
+from cosim.modules import import_from
 from cosim.result import Shown
 from cosim.validation import suggestion, validated
 
@@ -510,6 +511,10 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     `seen` are the files that led here. An FMU's relative path is made absolute, as seen from the
     file that names it. Raises ScenarioError.
     """
+    if not isinstance(source, str | Path):
+        raise ScenarioError(
+            f"a scenario is a preset's name or a path, not a {type(source).__name__}"
+        )
     path, origin = Path(source), f"scenario file '{source}'"
     if (drawn := RANDOM.fullmatch(str(source))) is not None:
         return read("paper")[0] | random_plant(int(drawn[1])), f"preset '{source}'"
@@ -522,6 +527,8 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
         )
     document = read_toml(path, origin, ScenarioError)
     where = path.resolve()
+    if path.parent != PRESETS:
+        import_from(where.parent)  # its `module:factory` may lie beside it
     return resolved(document, origin, where.parent, (*seen, str(where))), origin
 
 
@@ -542,6 +549,8 @@ def resolved(
         raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
     if base not in presets() and not RANDOM.fullmatch(base):
         base = str(folder / base)
+    if "\0" in base:
+        raise ScenarioError(f"{origin}: extends must not hold a null byte")
     if str(Path(base).resolve()) in seen:
         raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
     return merged(read(base, seen)[0], result)

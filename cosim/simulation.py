@@ -15,7 +15,7 @@ from cosim.errors import CosimError
 from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
 from cosim.scenario import Scenario
 from cosim.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
-from cosim.validation import known_keywords
+from cosim.validation import known_keywords, whole_number
 
 MEASURED = (
     "states", "actions", "stage_cost", "disturbances", "value", "residual", "failed",
@@ -34,8 +34,7 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     child the generator. On one seed two controllers meet the same disturbances and the same
     exploration noise (common random numbers). Raises CosimError on a negative seed.
     """
-    if seed < 0:
-        raise CosimError(f"seed must not be negative, not {seed}")
+    seed = whole_number("seed", seed, 0, CosimError)
     plant, exploration = np.random.SeedSequence(seed).spawn(2)
     return int(plant.generate_state(1, np.uint64)[0]), np.random.default_rng(exploration)
 
@@ -61,8 +60,7 @@ def simulate(
     (first the scenario's reference action) is then applied again, the failure is counted, and the
     controller is reset. Every other error is raised.
     """
-    if steps < 1:
-        raise CosimError(f"steps must be at least 1, not {steps}")
+    steps = whole_number("steps", steps, 1, CosimError)
     run = _Run(plant, controller, steps, seed, residuals)
     if recorder is not None:
         recorder.start(plant.scenario, controller, seed, steps, plant.units)
@@ -129,9 +127,11 @@ class _Run:
             begin = perf_counter()
             step = plant.step(applied)
             plant_time = perf_counter() - begin
-            value, residual = nan if solution is None else solution.value, nan
-            if self._residuals and solution is not None:
-                residual = solution.residual
+            value = residual = nan
+            if solution is not None:
+                value = self._number(solution, "value", k)
+                if self._residuals:
+                    residual = self._number(solution, "residual", k)
             row = [*s.tolist(), *applied.tolist(), step.stage_cost, *step.disturbance.tolist()]
             row += [value, residual, solution is None, prepare_time, feedback_time, plant_time]
             rows.append(row)
@@ -187,11 +187,23 @@ class _Run:
             end = perf_counter()
             if not hasattr(solution, "action"):
                 raise self._wrong(f"a {type(solution).__name__}, which is no solution")
+            if not isinstance(status := getattr(solution, "status", None), str):
+                raise self._wrong(f"a status that is no text but {status!r:.60}")
         except Exception as error:
             end = perf_counter()
             recover(controller, error)
         self._status.append(FALLBACK if solution is None else solution.status)
         return solution, middle - begin, end - middle
+
+    def _number(self, solution: Solution, name: str, k: int) -> float:
+        """A field of a solution that is a number; raises CosimError where it is none."""
+        given = getattr(solution, name, None)
+        if type(given) is float:
+            return given
+        if isinstance(given, bool) or not isinstance(given, int | float | np.integer | np.floating):
+            shown = " ".join(f"{given!r:.60}".split())
+            raise self._wrong(f"a {name} that is no number but {shown}", k)
+        return float(given)
 
     def _wrong(self, given: str, k: int | None = None) -> CosimError:
         at = "" if k is None else f", at step {k}"

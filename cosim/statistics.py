@@ -105,7 +105,12 @@ def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
 
 def regrets(cost: Array, optimum: Array | float) -> Array:
     """`regret` of each seed by itself, (S,)."""
-    return _each(cost - optimum, np.abs(optimum))
+    return relative(cost - optimum, optimum)
+
+
+def relative(difference: Array, optimum: Array | float) -> Array:
+    """Differences of costs in the unit of a regret, (J − J')/|J*| of each seed by itself, (S,)."""
+    return _each(difference, np.abs(optimum))
 
 
 def regret_terms(cost: Array, optimum: Array) -> Array:

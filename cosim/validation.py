@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from functools import wraps
 from inspect import signature
+from operator import index
 from typing import Any, ParamSpec, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -32,6 +33,17 @@ def validated(
         first, *others = cause.errors(include_url=False)
         more = f" ({len(others)} more problem{'s' * (len(others) > 1)})" if others else ""
         raise error(f"{origin}: {_complaint(dict(first), model)}{more}") from None
+
+
+def whole_number(name: str, value: Any, least: int, error: type[Exception]) -> int:
+    """An argument as an integer, NumPy's too; raises `error` on another kind or a smaller one."""
+    try:
+        number = index(value)
+    except TypeError:
+        raise error(f"{name} must be a whole number, not {f'{value!r}'[:60]}") from None
+    if isinstance(value, bool) or number < least:
+        raise error(f"{name} must be at least {least}, not {value}")
+    return number
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

@@ -16,8 +16,9 @@ from scipy.special import ndtr
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
+from cosim.modules import load_plugin
 from cosim.plant import FmuPlant
-from cosim.plugins import ALGORITHMS, load_plugin, registered
+from cosim.plugins import ALGORITHMS, registered
 from cosim.protocols import Matrix, Plant, Step, Vector
 from cosim.scenario import Scenario
 from cosim.simulation import recover

@@ -58,21 +58,22 @@ def load(path: Path, run: Mapping[str, Any]) -> State:
             return entries[table[ENTRY]] if table.keys() == {ENTRY} else table
 
         found, state = json.loads(entries["run"].tobytes(), object_hook=array)
+        there, state = _flat(dict(found)), dict(state)
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: there is no checkpoint to resume from; run without --resume"
         ) from error
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
     # Compare both as JSON, where tuples are lists.
-    there, here = _flat(found), _flat(json.loads(json.dumps(run)))
+    here = _flat(json.loads(json.dumps(run)))
     for key in sorted(there.keys() | here.keys()):
         if there.get(key) != here.get(key):
             raise CheckpointError(
                 f"{path}: the checkpoint is of another run: {key} is {there.get(key)!r} there and "
                 f"{here.get(key)!r} here; use another --out or the same settings"
             )
-    return dict(state)
+    return state
 
 
 def _flat(run: Mapping[str, Any]) -> dict[str, Any]:

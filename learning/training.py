@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from functools import reduce
 from importlib.metadata import version
 from math import gcd, inf, isfinite, isnan
+from numbers import Integral, Real
 from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -23,9 +24,10 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.errors import CapabilityError
-from cosim.files import check_target, write_atomically
+from cosim.files import check_target, staged, write_atomically
+from cosim.identity import depends_on
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller, depends_on
+from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller, Plant
 from cosim.result import Result, csv_text
 from cosim.scenario import Scenario
@@ -36,7 +38,7 @@ from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Strategy, TrainingLoop, Update, load_algorithm
 from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
-from learning.errors import ConfigurationError, DivergenceError
+from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.step import smallest_eigenvalue
 
 if TYPE_CHECKING:
@@ -89,6 +91,11 @@ class TrainingRun:
         for name, least in LEAST.items():
             if (value := getattr(self, name)) is not None and value < least:
                 raise ConfigurationError(f"{name} must be at least {least}, not {value}")
+        if self.seed >= HELD_OUT:
+            raise ConfigurationError(
+                f"seed must be below {HELD_OUT}, not {self.seed}: the noise from there on is held "
+                "out, to evaluate what was learned"
+            )
         for name in EVERY[1:]:
             if getattr(self, name) % self.log_every:
                 raise ConfigurationError(
@@ -135,6 +142,9 @@ def prepare(
     for name in options:
         if name not in OPTIONS:
             raise ConfigurationError(f"training has no option '{name}'{suggestion(name, OPTIONS)}")
+    _check_kinds({"samples": samples, **options})
+    if settings is not None and not isinstance(settings, Configuration | Mapping):
+        raise ConfigurationError(f"settings must be a table, not a {type(settings).__name__}")
     if not isinstance(settings, Configuration):
         settings = found.Configuration.from_dict(dict(settings or {}))
     # Intervals that are not given are near their defaults and fit the others.
@@ -150,6 +160,25 @@ def prepare(
         configuration=settings,
         **{**options, **dict.fromkeys(EVERY[1:], rows * log), "log_every": log, **given},
     )
+
+
+def _check_kinds(options: Mapping[str, Any]) -> None:
+    """Refuse options of another kind than the fields of `TrainingRun` by ConfigurationError."""
+    optional = {"samples", "rest_after", *EVERY}
+    for name, value in options.items():
+        if value is None and name in optional:
+            continue
+        kind: type = Integral if name in LEAST else Real if name == "divergence" else str
+        if not isinstance(value, kind) or isinstance(value, bool):
+            words = "a text" if kind is str else "a number" if kind is Real else "a whole number"
+            raise ConfigurationError(f"training: {name} must be {words}, not {value!r:.60}")
+    margin, carrier = options.get("divergence", 1.0), options.get("controller", "rti")
+    if not margin >= 1.0 or margin == inf:
+        raise ConfigurationError(f"training: divergence must be at least 1, not {margin}")
+    if carrier not in ("rti", "converged"):
+        raise ConfigurationError(
+            f"training: there is no controller '{carrier}'; there are rti and converged"
+        )
 
 
 def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> TrainingLoop:
@@ -209,6 +238,11 @@ def starting_parameters(
 
 CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
+FILES = (
+    CHECKPOINT, LOG, PARAMETERS, FIGURE, "learning.gif", "summary.json", "scenario.toml",
+    "training.rrd",
+)  # fmt: skip
+"""Files of a training; all in a folder belong to one run."""
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 FIGURES = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
@@ -411,13 +445,16 @@ class Training(Result):
 
     def save(self, folder: str | Path) -> Path:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        with staged(folder) as stage:
+            self.write_files(stage)
+        return Path(folder)
+
+    def write_files(self, folder: Path) -> None:
+        """Write the files of `save` one after the other."""
         write_atomically(folder / LOG, to_csv(self.rows))
         self.parameters.save(folder / PARAMETERS)
         write_atomically(folder / "scenario.toml", self.run.scenario.to_toml())
         self.plot(folder / FIGURE)
-        return folder
 
     def summary(self) -> dict[str, Any]:
         """The training as a JSON document: settings, the greedy policy's figures, how it ended."""
@@ -651,8 +688,14 @@ class _Session:
         self.loop.restart()
         if self.out is None:
             return
-        write_atomically(self.out / LOG, to_csv(self.rows))
-        self.loop.parameters.save(self.out / PARAMETERS)
+        # Nothing of another run may stay beside the files of this one.
+        with staged(self.out, FILES) as stage:
+            write_atomically(stage / LOG, to_csv(self.rows))
+            self.loop.parameters.save(stage / PARAMETERS)
+            self._save_state(stage / CHECKPOINT)
+
+    def _save_state(self, path: Path) -> None:
+        """Write what resuming needs, where the plant can say its state."""
         try:
             plant = self.plant.serialise(self.plant.snapshot())
             state = self.loop.state()
@@ -664,16 +707,23 @@ class _Session:
             "rows": [[*row.values()] for row in self.rows],
             "row_thetas": np.array([row.parameters.theta for row in self.rows]),
         }
-        checkpoint.save(self.out / CHECKPOINT, self.identity, state)
+        checkpoint.save(path, self.identity, state)
 
     def load(self) -> None:
         """Load the folder's checkpoint; raises CheckpointError if none fits."""
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
-        state = checkpoint.load(self.out / CHECKPOINT, self.identity)
-        self.rows = [
-            LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
-            for figures, theta in zip(state["rows"], state["row_thetas"], strict=True)
-        ]
-        self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
-        self.loop.restore(state)
+        state = checkpoint.load(path := self.out / CHECKPOINT, self.identity)
+        try:
+            self.rows = [
+                LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
+                for figures, theta in zip(state["rows"], state["row_thetas"], strict=True)
+            ]
+            self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
+            self.loop.restore(state)
+        except Exception as error:  # whatever arrays of other names, shapes or kinds lead to
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            raise CheckpointError(
+                f"{path}: the checkpoint does not hold the state of this run ({said}); begin anew "
+                "by --overwrite"
+            ) from error

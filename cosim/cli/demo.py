@@ -41,7 +41,7 @@ def demo(
         from cosim.comparison import RunSignals
         from cosim.figures.style import save
         from cosim.figures.trajectory import overlay_figure
-        from cosim.files import temporary_folder
+        from cosim.files import staged, temporary_folder
         from cosim.recording import record_overlay, record_training
         from learning.training import HELD_OUT
 
@@ -69,17 +69,19 @@ def demo(
                 )
                 for name in (NAIVE, LEARNT, OPTIMAL)
             }
-        summary = found.summary()
-        show(summary, out_)
-        found.write(folder)
-        save(overlay_figure(runs), folder / "before-after.png")
-        trained[LEARNT].save(folder)
+        summary = found.summary() | {"training": trained[LEARNT].summary()}
         signals = {
             name: RunSignals(name, run.signals, run.status, scenario.limits)
             for name, run in runs.items()
         }
-        record_overlay(folder / "demo.rrd", signals, scenario.description)
-        record_training(folder / "training.rrd", trained[LEARNT])
+        with staged(folder) as stage:
+            found.write_files(stage)
+            save(overlay_figure(runs), stage / "before-after.png")
+            trained[LEARNT].write_files(stage)
+            record_overlay(stage / "demo.rrd", signals, scenario.description)
+            record_training(stage / "training.rrd", trained[LEARNT])
+            cli.write_summary(stage, summary)
+        show(summary, out_)
         # `make demo` activates no environment.
         command = "cosim" if shutil.which("cosim") else f"{sys.executable} -m cosim"
         out_.note(
@@ -88,4 +90,4 @@ def demo(
             f"learnt θ   {folder / 'parameters.toml'} (a controller in every command)\n"
             f"look at the recording with: {command} view {folder / 'demo.rrd'}"
         )
-        out_.json(summary | {"training": trained[LEARNT].summary()}, folder)
+        out_.json(summary)

@@ -11,7 +11,7 @@ import typer
 
 import cosim
 from cosim.cli import output as cli
-from cosim.files import write_atomically
+from cosim.files import staged, write_atomically
 
 
 def evaluate(
@@ -29,7 +29,7 @@ def evaluate(
     """Compare controllers on the same disturbances, seed by seed.
 
     Writes evaluation.csv (a row per controller and seed), evaluation.png, summary.json, timing.csv
-    and scenario.toml. Run again with the same --out to go on after an interruption.
+    and scenario.toml, together at the end. Every run is computed anew.
 
     Args:
         controllers: Comma-separated, or the option again: naive, tuned, commissioned, cautious,
@@ -43,9 +43,9 @@ def evaluate(
     with cli.output(json) as out_:
         from loky import cpu_count
 
-        from cosim.evaluation import named_controllers
+        from cosim.evaluation import FILES, named_controllers
 
-        task = cli.load_scenario(scenario)
+        task = cosim.Scenario.load(scenario)
         if trajectories is not None:
             _judge(task, trajectories, cli.open_folder(out), out_)
             return
@@ -55,39 +55,35 @@ def evaluate(
         words += ["--first-seed", str(first_seed)] * (first_seed > 0) + ["--steps", str(steps)]
         folder = cli.open_folder(out)
         out_.announce(task.plant.fmu)
-        total = (len(named) + ("optimal" not in named)) * seeds * steps
-        with cli.followed(out_, f"samples on {task.name}", total) as report:
-            evaluation = cosim.evaluate(
-                task,
-                named,
-                range(first_seed, first_seed + seeds),
-                steps,
-                folder=folder,
-                jobs=jobs or cpu_count(),
-                scheduler=scheduler,
-                progress=report,
-                command=shlex.join(["cosim", "evaluate", *words]),
-            )
+        evaluation = cosim.evaluate(
+            task,
+            named,
+            range(first_seed, first_seed + seeds),
+            steps,
+            jobs=jobs or cpu_count(),
+            scheduler=scheduler,
+            progress=out_.live,
+            command=shlex.join(["cosim", "evaluate", *words]),
+        )
         summary = evaluation.summary()
-        evaluation.write(folder)
-        write_atomically(folder / "scenario.toml", task.to_toml())
+        with staged(folder, FILES) as stage:
+            evaluation.write_files(stage)
+            cli.write_summary(stage, summary)
         show(summary, out_)
         out_.note(f"files are in {folder.resolve()}")
-        out_.json(summary, folder)
+        out_.json(summary)
 
 
 def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
-    from cosim.evaluation import judge
+    from cosim.evaluation import FILES, judge
     from cosim.statistics import mean, regret, shown
 
     table = judge(scenario, trajectories)
     cost, optimum = table["J"].to_numpy(), table["optimum"].to_numpy()
-    write_atomically(folder / "judged.csv", table.to_csv(index=False))
     rows = [
         (row.file, str(row.seed), str(row.steps), shown(row.J, digits=6), f"{100 * row.regret:.3f}")
         for row in table.itertuples()
     ]
-    output.table("judged runs", ("file", "seed", "steps", "J", "regret %"), rows)
     summary = {
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,
@@ -96,7 +92,11 @@ def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: c
         "regret": regret(cost, optimum)._asdict(),
         "violating_share": float(table["violating_share"].mean()),
     }
-    output.json(summary, folder)
+    with staged(folder, FILES) as stage:
+        write_atomically(stage / "judged.csv", table.to_csv(index=False))
+        cli.write_summary(stage, summary)
+    output.table("judged runs", ("file", "seed", "steps", "J", "regret %"), rows)
+    output.json(summary)
 
 
 def show(summary: dict[str, Any], output: cli.Output) -> None:

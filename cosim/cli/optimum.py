@@ -37,7 +37,7 @@ def optimum(
     with cli.output(json) as out_:
         from controllers.optimum import QuasiStaticPolicy, change_of
 
-        task = cli.load_scenario(scenario)
+        task = cosim.Scenario.load(scenario)
         if is_file(task.plant.fmu):
             out_.announce(task.plant.fmu)
             with cosim.FmuPlant(task) as plant:
@@ -135,7 +135,7 @@ def tuning(
         from controllers.factories import value_offset
         from controllers.problem import Problem
 
-        task = cli.load_scenario(scenario)
+        task = cosim.Scenario.load(scenario)
         problem = Problem.from_scenario(task)
         result = tune(problem)
         parameters = result.parameters.replace({"c_lambda": value_offset(task, problem)})

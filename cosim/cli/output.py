@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 import typer
 
-import cosim
 from cosim.errors import CosimError
 from cosim.files import write_atomically
 from cosim.processes import Terminated, hold, redirected_output, release, watch
@@ -98,15 +97,12 @@ class Output:
                 table.add_row(*(escape(row[k]) for k in part))
             console.print(table)
 
-    def json(self, document: Mapping[str, Any], folder: Path | None = None) -> None:
-        """Print the document if JSON was asked for; with a folder, write its summary.json too."""
-        text = dump(document) if self.as_json or folder else ""
-        if folder is not None:
-            write_atomically(folder / "summary.json", text)
+    def json(self, document: Mapping[str, Any]) -> None:
+        """Print the document if JSON was asked for."""
         if self.as_json and self._stdout is not None:
-            os.write(self._stdout, text.encode())
+            os.write(self._stdout, dump(document).encode())
         elif self.as_json:
-            sys.stdout.write(text)
+            sys.stdout.write(dump(document))
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""
@@ -184,6 +180,11 @@ def followed(out: Output, label: str, samples: int) -> Iterator[Callable[[int, s
         yield report
 
 
+def write_summary(folder: Path, document: Mapping[str, Any]) -> None:
+    """Write summary.json."""
+    write_atomically(folder / "summary.json", dump(document))
+
+
 def dump(document: Mapping[str, Any]) -> str:
     """JSON text with sorted keys, on one line if long; non-finite numbers become null."""
     from pydantic_core import to_json
@@ -212,15 +213,3 @@ def writable_folder(folder: Path) -> Path:
         reason = getattr(error, "strerror", None) or error
         raise CosimError(f"cannot write to folder '{folder}': {reason}") from None
     return folder
-
-
-def load_scenario(name: str) -> cosim.Scenario:
-    """Load a preset or TOML file, so that its `module:function` may lie beside it or here.
-
-    Raises ScenarioError.
-    """
-    from cosim.plugins import import_from
-
-    if Path(name).is_file():
-        import_from(Path(name).resolve().parent)
-    return cosim.Scenario.load(name)

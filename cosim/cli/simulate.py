@@ -13,6 +13,10 @@ from cosim.cli import output as cli
 
 DRAWN = 20_000
 """Samples of the longest run that is drawn: more are a grey band, and take seconds."""
+FILES = (
+    "trajectory.csv", "trajectory.png", "timing.csv", "summary.json", "scenario.toml", "run.rrd",
+)  # fmt: skip
+"""Files of a run; all in a folder belong to one."""
 
 
 def simulate(
@@ -38,50 +42,14 @@ def simulate(
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with cli.output(json) as out_:
-        from importlib.metadata import version
+        from cosim.files import staged
 
-        from controllers import compile_functions
-        from cosim.files import write_atomically
-        from cosim.plugins import parameters_hash
-        from cosim.simulation import functions_of
-
-        loaded = cli.load_scenario(scenario)
+        loaded = cosim.Scenario.load(scenario)
         folder = cli.open_folder(out)
         out_.announce(loaded.plant.fmu)
-        recorder = None
-        if record:
-            from cosim.recording import RerunRecorder, spare_pandas
-
-            recorder = RerunRecorder(folder / "run.rrd")
-        between = recorder.intermediate if recorder else None
-        with cosim.FmuPlant(loaded, intermediate=between) as plant:
-            law = cosim.build_controller(controller, loaded)
-            compile_functions(law, steps)
-            if record:  # a plug-in's own use of pandas stays
-                spare_pandas()
-            run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=out_.live)
-            summary: dict[str, Any] = {
-                "version": version("rti-cosim"),
-                "scenario": loaded.name,
-                "scenario_hash": loaded.hash,
-                "fmu": plant.fmu_path.name,
-                "fmu_sha256": plant.fmu_sha256,
-                "controller": controller,
-                "parameters_hash": parameters_hash(law) or None,
-                "seed": seed,
-                **run.summary(),
-                "timing": run.timing_summary() | {"functions": functions_of(law)},
-            }
-        if not record:
-            # A recording of another run must not stay beside this run's signals.
-            (folder / "run.rrd").unlink(missing_ok=True)
-        run.write_csv(folder / "trajectory.csv")
-        run.write_timing_csv(folder / "timing.csv")
-        if 1 < steps <= DRAWN:
-            run.plot(folder / "trajectory.png")
-        else:  # nor may a shorter run's stay
-            (folder / "trajectory.png").unlink(missing_ok=True)
-        write_atomically(folder / "scenario.toml", loaded.to_toml())
+        with staged(folder, FILES) as stage:
+            summary = _run(loaded, controller, steps, seed, stage, record, out_.live)
+            cli.write_summary(stage, summary)
         rows = [
             ("economic cost", f"{summary['economic_cost']:.3f}"),
             ("mean violation", f"{summary['mean_violation']:.5f}"),
@@ -91,9 +59,58 @@ def simulate(
         ]
         rows += [
             (f"{name} time, median / 99 %", f"{t['median_us']:.1f} / {t['p99_us']:.1f} µs")
-            for name, t in run.timing_summary().items()
+            for name, t in summary["timing"].items()
+            if name != "functions"
         ]
         title = f"{controller} on {loaded.name}, {steps} samples, seed {seed}"
         out_.table(title, ("per sample", "value"), rows)
         out_.note(f"files are in {out.resolve()}")
-        out_.json(summary, folder)
+        out_.json(summary)
+
+
+def _run(
+    scenario: cosim.Scenario,
+    controller: str,
+    steps: int,
+    seed: int,
+    folder: Path,
+    record: bool,
+    progress: bool,
+) -> dict[str, Any]:
+    """Simulate, and write all files but summary.json to an empty folder; the summary."""
+    from importlib.metadata import version
+
+    from controllers import compile_functions
+    from cosim.plugins import parameters_hash
+    from cosim.simulation import functions_of
+
+    recorder = None
+    if record:
+        from cosim.recording import RerunRecorder, spare_pandas
+
+        recorder = RerunRecorder(folder / "run.rrd")
+    between = recorder.intermediate if recorder else None
+    with cosim.FmuPlant(scenario, intermediate=between) as plant:
+        law = cosim.build_controller(controller, scenario)
+        compile_functions(law, steps)
+        if record:  # a plug-in's own use of pandas stays
+            spare_pandas()
+        run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=progress)
+        summary: dict[str, Any] = {
+            "version": version("rti-cosim"),
+            "scenario": scenario.name,
+            "scenario_hash": scenario.hash,
+            "fmu": plant.fmu_path.name,
+            "fmu_sha256": plant.fmu_sha256,
+            "controller": controller,
+            "parameters_hash": parameters_hash(law) or None,
+            "seed": seed,
+            **run.summary(),
+            "timing": run.timing_summary() | {"functions": functions_of(law)},
+        }
+    run.write_csv(folder / "trajectory.csv")
+    run.write_timing_csv(folder / "timing.csv")
+    if 1 < steps <= DRAWN:
+        run.plot(folder / "trajectory.png")
+    (folder / "scenario.toml").write_text(scenario.to_toml(), "utf-8")
+    return summary

@@ -38,7 +38,9 @@ def run(
         found = _execute(file, out, out_, jobs=jobs, scheduler=scheduler)
         _show(found, out_)
         out_.note(f"tables are in {out.resolve()}; cosim study report {out} draws them")
-        out_.json(_summary(found), found.folder)
+        summary = _summary(found)
+        cli.write_summary(found.folder, summary)
+        out_.json(summary)
 
 
 def _execute(
@@ -125,7 +127,8 @@ def report(
 
 def _summary(found: cosim.StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is timing.csv by run."""
-    from cosim.studies.run import TIMING, read_table
+    from cosim.evaluation import TIMING
+    from cosim.studies.run import read_table
 
     timing = read_table(found.folder / TIMING, needed=["run"])
     return {
@@ -169,7 +172,9 @@ def reproduce(
         _show(found, out_)
         out_.table(*found.paper())
         out_.note(f"the report is {page.resolve()}")
-        out_.json(_summary(found), found.folder)
+        summary = _summary(found)
+        cli.write_summary(found.folder, summary)
+        out_.json(summary)
 
 
 @results.command()

@@ -7,14 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+import cosim
 from cosim.cli import output as cli
 from cosim.errors import CosimError
-
-FILES = (
-    "checkpoint.npz", "learning.csv", "learning.gif", "learning.png", "parameters.toml",
-    "summary.json", "training.rrd",
-)  # fmt: skip
-"""Files of a training; all in a folder belong to one run."""
 
 
 def train(
@@ -67,8 +62,9 @@ def train(
     given = locals()
     with cli.output(json) as out_:
         from controllers.optimum import stored_optimum
+        from cosim.files import staged
         from learning.algorithm import load_algorithm
-        from learning.training import CHECKPOINT, OPTIONS, prepare, run_training
+        from learning.training import CHECKPOINT, FILES, OPTIONS, prepare, run_training
 
         found = load_algorithm(algorithm)
         if explain:
@@ -78,7 +74,7 @@ def train(
             return
         settings = found.Configuration.from_assignments(assignments or [])
         options = {name: given[name] for name in OPTIONS}
-        run = prepare(algorithm, cli.load_scenario(scenario), samples, settings, options)
+        run = prepare(algorithm, cosim.Scenario.load(scenario), samples, settings, options)
         folder = cli.open_folder(out)
         there = [name for name in FILES if (folder / name).exists()]
         if there and not (resume or overwrite):
@@ -100,20 +96,18 @@ def train(
             out_.note(f"left no checkpoint, --resume is not possible: {reason}")
         timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
         summary = training.summary() | {"timing": timing}
-        training.save(folder)
-        for name, wanted in (("learning.gif", gif), ("training.rrd", record)):
-            if overwrite and not wanted:
-                # Only now: had this run failed, the one before it would have been lost.
-                (folder / name).unlink(missing_ok=True)
-        if gif:
-            training.animate(folder / "learning.gif")
-        if record:
-            from cosim.recording import record_training
+        with staged(folder, set(FILES) - {CHECKPOINT}) as stage:
+            training.write_files(stage)
+            if gif:
+                training.animate(stage / "learning.gif")
+            if record:
+                from cosim.recording import record_training
 
-            record_training(folder / "training.rrd", training)
+                record_training(stage / "training.rrd", training)
+            cli.write_summary(stage, summary)
         _show(summary, out_)
         out_.note(f"the learning curve is {folder / 'learning.png'}")
-        out_.json(summary, folder)
+        out_.json(summary)
     if training.status != "finished":
         raise typer.Exit(1)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import itertools
-import os
 import shutil
 import stat
 import sys
@@ -26,6 +25,7 @@ from xml.etree import ElementTree
 import fmpy
 import numpy as np
 from fmpy import fmi2, fmi3
+from fmpy.fmi1 import _FMU
 from fmpy.logging import addLoggerProxy
 from fmpy.model_description import read_model_description
 from numpy.typing import NDArray
@@ -235,8 +235,6 @@ def library_path(fmu: UnpackedFmu) -> Path:
 WARNING, DISCARD, FATAL = 1, 2, 4
 _STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
-# fmpy changes the working directory while it loads a library.
-_construction_lock = threading.Lock()
 _alive: Counter[str] = Counter()
 
 
@@ -312,6 +310,43 @@ class Native(ctypes.Structure):
 
 NOT_FINITE = 5
 """Fault of a compiled loop: an output or state is not finite; lower numbers: a call of FMI."""
+
+
+class _LoadedByPath(_FMU):  # type: ignore[misc]
+    """The base of fmpy's instances, without its change of the working directory of all threads.
+
+    The library's folder is searched for those that it needs: by its own run path, and on Windows
+    because it is loaded by a full path.
+    """
+
+    def __init__(
+        self,
+        guid: str,
+        modelIdentifier: str,
+        unzipDirectory: str,
+        libraryPath: str,
+        instanceName: str | None = None,
+    ) -> None:
+        self.guid = guid
+        self.modelIdentifier = modelIdentifier
+        self.unzipDirectory = unzipDirectory
+        self.instanceName = instanceName or modelIdentifier
+        self.fmiCallLogger = None
+        self.requireFunctions = True
+        self._functions: dict[str, Any] = {}
+        self.component = None
+        self.callbacks = None
+        self.dll = ctypes.cdll.LoadLibrary(libraryPath)
+        self._loadFunctions()
+
+
+# fmpy reads the version of FMI from the name of the class.
+class FMU2ByPath(fmi2.FMU2Slave, _LoadedByPath):  # type: ignore[misc]
+    """fmpy's FMI 2.0 instance."""
+
+
+class FMU3ByPath(fmi3.FMU3Slave, _LoadedByPath):  # type: ignore[misc]
+    """fmpy's FMI 3.0 instance."""
 
 
 class Instance(ABC):
@@ -397,24 +432,20 @@ class Instance(ABC):
 
     def _load(self) -> Any:
         library = str(library_path(self.fmu).resolve())
-        with _construction_lock:
-            folder = Path.cwd()
-            try:
-                return self._instantiate(
-                    guid=self.fmu.description.guid,
-                    modelIdentifier=self._interface.modelIdentifier,
-                    unzipDirectory=str(self.fmu.folder),
-                    libraryPath=library,
-                )
-            # fmpy raises bare Exception when the library does not load or instantiate.
-            except Exception as error:
-                tool = self._interface.needsExecutionTool
-                hint = "; it needs the tool that made it (needsExecutionTool)" if tool else ""
-                raise PlantError(
-                    f"FMU '{self.fmu.path}' cannot be instantiated: {error}{hint}{self._log()}"
-                ) from None
-            finally:
-                os.chdir(folder)
+        try:
+            return self._instantiate(
+                guid=self.fmu.description.guid,
+                modelIdentifier=self._interface.modelIdentifier,
+                unzipDirectory=str(self.fmu.folder),
+                libraryPath=library,
+            )
+        # fmpy raises bare Exception when the library does not instantiate.
+        except Exception as error:
+            tool = self._interface.needsExecutionTool
+            hint = "; it needs the tool that made it (needsExecutionTool)" if tool else ""
+            raise PlantError(
+                f"FMU '{self.fmu.path}' cannot be instantiated: {error}{hint}{self._log()}"
+            ) from None
 
     def _function(self, name: str) -> Any:
         """A function pointer of our own, free of the argument types that fmpy attaches."""
@@ -716,7 +747,7 @@ class Fmi2Instance(Instance):
     def _instantiate(self, **where: Any) -> Any:
         name = f"cosim-{next(_numbers)}"
         _logs[name.encode()] = self.messages
-        slave = fmi2.FMU2Slave(instanceName=name, **where)
+        slave = FMU2ByPath(instanceName=name, **where)
         slave.instantiate(callbacks=_callbacks, loggingOn=True)
         return slave
 
@@ -766,7 +797,7 @@ class Fmi3Instance(Instance):
         def log(_: Any, status: int, category: bytes, message: bytes) -> None:
             messages.append(message.decode("utf-8", "replace"))
 
-        slave = fmi3.FMU3Slave(**where)
+        slave = FMU3ByPath(**where)
         slave.instantiate(loggingOn=True, logMessage=log, **self._intermediate_update())
         return slave
 

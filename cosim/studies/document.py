@@ -19,7 +19,7 @@ Source = Annotated[str, Field(min_length=1)]
 PerScenario = Count | dict[str, Count]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""
 DEFAULT = "default"
-Hour = Annotated[float, Field(gt=0.0)]
+Hour = Annotated[float, Field(gt=0.0, le=1e6)]
 Hours = Annotated[list[Hour], Field(min_length=1)]
 
 
@@ -157,6 +157,8 @@ class StudyTable(Table):
     """Heading of the report; the name, if left out."""
     description: str = ""
     """A paragraph for readers."""
+    depends_on: list[Source] = []
+    """Data files that plug-ins read, relative to the study's file: edited, their runs are anew."""
     scenarios: Annotated[list[Source], Field(min_length=1)]
     """Presets, scenario files, or names of the file's own `[[scenario]]` tables."""
     scenario: list[dict[str, Any]] = []

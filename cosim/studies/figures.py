@@ -19,7 +19,8 @@ from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, Dots, EndLabel, Look, palette, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
-from cosim.protocols import Array, Controller
+from cosim.measurement import built
+from cosim.protocols import Array
 from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import regrets, td_error_mean
 from cosim.studies.operation import Judged
@@ -358,7 +359,7 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
 def _policy(run: Run, out: Path) -> Policy:
     trained = run.training is not None
     theta = (out / run.folder / PARAMETERS).read_text("utf-8") if trained else ""
-    controller: Controller = run.policy(theta)
+    controller = built(run.source(theta), run.scenario)
 
     def act(s: Array) -> Array:
         controller.reset()

@@ -21,7 +21,7 @@ from cosim.protocols import Array, Controller
 from cosim.result import TextTable
 from cosim.scenario import VIOLATING, Scenario
 from cosim.simulation import simulate
-from cosim.statistics import paired_difference, shown
+from cosim.statistics import paired_difference, regrets, relative, shown
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
 from learning.training import LogRow, TrainingRun, begin
@@ -194,10 +194,11 @@ def judged(lives: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> Judged:
     mean = greedy.groupby(key).J.mean().rename("greedy_J").reset_index()
     found = found.merge(mean, on=key, how="left")
     level = found.samples.map({samples: float(cost.mean()) for samples, cost in best.items()})
-    found["regret"] = (found.greedy_J - level) / level.abs()
-    found["life_regret"] = (found.J - found.optimal_J) / found.optimal_J.abs()
-    found["dearest"] = (found.dearest - found.optimal_J) / found.optimal_J.abs()
-    found["excess"] = found.excess / found.optimal_J.abs()
+    found["regret"] = regrets(found.greedy_J.to_numpy(), level.to_numpy())
+    optimal = found.optimal_J.to_numpy()
+    found["life_regret"] = regrets(found.J.to_numpy(), optimal)
+    found["dearest"] = regrets(found.dearest.to_numpy(), optimal)
+    found["excess"] = relative(found.excess.to_numpy(), optimal)
     return Judged(costs, best, found)
 
 

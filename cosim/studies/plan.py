@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -12,12 +13,25 @@ from typing import Any, Self, TypeVar, get_args, get_origin
 
 from controllers.optimum import stored_optimum
 from cosim.errors import StudyError
+from cosim.evaluation import EVALUATION
+from cosim.identity import code_hash, versions
+from cosim.measurement import Noise
+from cosim.modules import import_from
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
+from cosim.plugins import ControllerSource
 from cosim.scenario import Scenario, resolved
-from cosim.studies.document import DEFAULT, CaseTable, StudyTable, read
-from cosim.studies.run import EVALUATION, GREEDY, LOG, PARAMETERS, Noise, Run, safe
+from cosim.studies.document import DEFAULT, CaseTable, StudyTable, TrajectoryTable, read
+from cosim.studies.run import (
+    GREEDY,
+    LOG,
+    PARAMETERS,
+    Run,
+    Training,
+    functions_for,
+    safe,
+)
 from cosim.validation import instead, validated
+from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.training import HELD_OUT, prepare
@@ -27,6 +41,8 @@ TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"
 """Folders of what a study keeps of its runs."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
+MOST_SAMPLES = 100_000_000
+"""Samples of the longest run."""
 T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
 
@@ -85,6 +101,15 @@ class Study:
     def name(self) -> str:
         """The study's name."""
         return self.table.name
+
+    @property
+    def depends_on(self) -> dict[str, str]:
+        """Paths of the data files that its plug-ins read, by name; StudyError if one is missing."""
+        paths = {f"file {name}": self.folder / name for name in self.table.depends_on}
+        for path in paths.values():
+            if not path.is_file():
+                raise StudyError(f"depends_on: there is no file '{path}'")
+        return {name: str(path) for name, path in paths.items()}
 
     @cached_property
     def scenarios(self) -> dict[str, Scenario]:
@@ -232,10 +257,16 @@ class Study:
         hours = self._of(self.table.operation.hours, scenario, "operation.hours")
         return self.samples_of(hours, scenario)
 
-    def samples_of(self, hours: Iterable[float], scenario: str) -> tuple[int, ...]:
+    def samples_of(self, hours: Sequence[float], scenario: str) -> tuple[int, ...]:
         """Hours of operation as samples, increasing."""
         h = self.scenarios[scenario].sampling_time
-        return tuple(sorted({max(1, round(3600.0 * hour / h)) for hour in hours}))
+        samples = sorted({max(1, round(3600.0 * hour / h)) for hour in hours})
+        if samples and samples[-1] > MOST_SAMPLES:
+            raise StudyError(
+                f"operation.hours: {max(hours):g} h are {samples[-1]} samples of '{scenario}'; a "
+                f"run has at most {MOST_SAMPLES}"
+            )
+        return tuple(samples)
 
     def _of(self, value: T | dict[str, T], scenario: str, field: str) -> T:
         if not isinstance(value, dict):
@@ -296,58 +327,119 @@ def plan(study: Study) -> Plan:
     for name, described in study.scenarios.items():
         with FmuPlant(described) as plant:
             plants[name] = {"scenario": described.hash, "fmu": plant.fmu_sha256}
-    depends: dict[tuple[str, str], dict[str, str]] = {}
+    content: dict[tuple[str, str], _Content] = {}
     runs = []
     # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
     met = sorted({seed for case in study.cases for seed in case.training_seeds})
     for seed, name, case in product((None, *met), study.scenarios, study.all_cases):
         if seed not in (case.training_seeds or (None,)) or name not in case.scenarios:
             continue
-        scenario = study.scenarios[name]
-        training = None if seed is None else study.training(case, name, seed)
-        if (case.name, name) not in depends:
-            # Raise here what a wrong case would raise in its run.
-            if ":" in (case.controller or ""):
-                build_controller(case.target, scenario)
-            if training is not None:
-                prepare(scenario=scenario, **training)
-            parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
-            depends[case.name, name] = depends_on(scenario, *map(study.located, parts))
-        facts: dict[str, Any] = {**depends[case.name, name], "fmu": plants[name]["fmu"]}
-        if training is None:
-            facts["controller"] = case.controller
-        else:  # as the file says, so that results depend on no folder
-            facts["training"] = training | {"options": training["options"] | {"start": case.start}}
-        judged = training is not None or case.name == study.optima.get(name)
-        marks = study.marks(name) if judged else ()
-        noise = {EVALUATION: (own := study.noise(name))}
-        cases = [case for case in study.cases if name in case.scenarios]
-        if training is None and any(case.algorithm for case in cases):
-            noise[GREEDY] = study.held_out(name)
-        at_mark = study.held_out(name)._replace(burn_in=own.burn_in)
-        noise |= {f"greedy-{mark}.csv": at_mark._replace(mark=mark) for mark in marks}
-        first = seed in (None, *case.training_seeds[:1])  # only its files are kept
-        tables = [
-            table
-            for table in study.table.trajectory
-            if first
-            and case.name in (table.cases or [case.name])
-            and name in (table.scenarios or [name])
-        ]
-        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in tables}
-        where, stem = safe(name), safe(case.name)
-        kept = {t.file: f"{TRAJECTORIES}/{t.name}/{where}/{stem}.csv" for t in tables}
-        if first and case.name in study.table.logs:
-            kept[LOG] = f"{LOGS}/{where}-{stem}.csv"
-            kept[PARAMETERS] = f"{THETA}/{where}-{stem}.toml"
-        seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
-        if training is None and seeds:  # the optimum, on the noise of the training seeds
-            noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
-        source = study.located(case.controller or "") or None
-        runs.append(Run(scenario, case.name, facts, noise, source, seed, training, kept, marks))
+        if (case.name, name) not in content:
+            content[case.name, name] = _read(study, case, name)
+        runs.append(_run(study, case, name, seed, content[case.name, name]))
     _check_names(study)
     about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What the runs of a case on a scenario have in common, as it was read.
+
+    `theta` is the text of its θ file: of the controller, or of the start of a training.
+    """
+
+    conditions: Conditions
+    controller: ControllerSource
+    theta: str | None
+
+
+def _read(study: Study, case: Case, name: str) -> _Content:
+    """Read what a case needs; raises what a wrong case would raise in its run."""
+    scenario = study.scenarios[name]
+    controller = ControllerSource.read(study.located(case.controller or case.start))
+    if case.algorithm is not None:
+        prepare(scenario=scenario, **study.training(case, name, 0))
+    elif ":" in (case.controller or ""):
+        controller.build(scenario)
+    conditions = Conditions.of_now(scenario, case.target, files=study.depends_on)
+    return _Content(conditions, controller, controller.theta)
+
+
+def _run(study: Study, case: Case, name: str, seed: int | None, content: _Content) -> Run:
+    """A case's run on a scenario."""
+    marks = study.marks(name) if seed is not None or case.name == study.optima.get(name) else ()
+    training = None
+    if seed is not None:
+        training = Training(study.training(case, name, seed), content.theta, marks)
+    noise, at_marks = _noise(study, case, name, seed, marks)
+    facts: dict[str, Any] = {**content.conditions.facts, "functions": functions_for(noise)}
+    if content.theta is not None:
+        text = content.theta.encode()
+        facts[Path(content.controller.name).name] = hashlib.sha256(text).hexdigest()
+    if training is None:
+        facts["controller"] = case.controller
+    else:  # as the file says, so that results depend on no folder
+        options = training.arguments["options"] | {"start": case.start}
+        facts["training"] = {**training.arguments, "options": options}
+    return Run(
+        conditions=content.conditions,
+        case=case.name,
+        facts=facts,
+        noise=noise,
+        controller=content.controller if training is None else None,
+        seed=seed,
+        training=training,
+        kept=_kept(study, case, name, seed),
+        marks=at_marks,
+    )
+
+
+def _noise(
+    study: Study, case: Case, name: str, seed: int | None, marks: Iterable[int]
+) -> tuple[dict[str, Noise], dict[str, int]]:
+    """Noise of a run's evaluations by file, and the mark of operation of those that have one."""
+    noise = {EVALUATION: study.noise(name)}
+    others = [other for other in study.cases if name in other.scenarios]
+    if seed is None and any(other.algorithm for other in others):
+        noise[GREEDY] = study.held_out(name)
+    at_mark = study.held_out(name)._replace(burn_in=noise[EVALUATION].burn_in)
+    at_marks = {f"greedy-{mark}.csv": mark for mark in marks}
+    noise |= dict.fromkeys(at_marks, at_mark)
+    for table in _trajectories(study, case, name, seed):
+        noise[table.file] = Noise((table.seed,), table.steps, whole=True)
+    seeds = tuple(sorted({one for other in others for one in other.training_seeds}))
+    if seed is None and seeds:  # the optimum, on the noise of the training seeds
+        noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
+    return noise, at_marks
+
+
+def _is_first(case: Case, seed: int | None) -> bool:
+    """Whether a run is the one of its case whose files are kept."""
+    return seed in (None, *case.training_seeds[:1])
+
+
+def _trajectories(
+    study: Study, case: Case, name: str, seed: int | None
+) -> Iterator[TrajectoryTable]:
+    """The trajectories that a run is asked for."""
+    for table in study.table.trajectory:
+        wanted = case.name in (table.cases or [case.name])
+        if wanted and name in (table.scenarios or [name]) and _is_first(case, seed):
+            yield table
+
+
+def _kept(study: Study, case: Case, name: str, seed: int | None) -> dict[str, str]:
+    """Where the study keeps a copy of a run's files, by file."""
+    where, stem = safe(name), safe(case.name)
+    kept = {
+        table.file: f"{TRAJECTORIES}/{table.name}/{where}/{stem}.csv"
+        for table in _trajectories(study, case, name, seed)
+    }
+    if _is_first(case, seed) and case.name in study.table.logs:
+        kept[LOG] = f"{LOGS}/{where}-{stem}.csv"
+        kept[PARAMETERS] = f"{THETA}/{where}-{stem}.toml"
+    return kept
 
 
 def _check_names(study: Study) -> None:

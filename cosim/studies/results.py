@@ -17,8 +17,10 @@ from matplotlib.figure import Figure
 
 from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
+from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import Dots, Look, palette, save_set
-from cosim.files import read_json, write_atomically
+from cosim.files import read_json, staged, write_atomically
+from cosim.processes import holding
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
 from cosim.simulation import reporting
@@ -27,12 +29,9 @@ from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
 from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
 from cosim.studies.run import (
-    EVALUATION,
     GREEDY,
     INDICATORS,
     LOG,
-    TIMING,
-    Report,
     Runner,
     RunStore,
     read_table,
@@ -45,6 +44,8 @@ from cosim.validation import instead, known_keywords
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
 TABLES, OPERATION = (RUNS, EVALUATION, CURVES), "operation.csv"
+FILES = (*TABLES, SUMMARY, AGGREGATE, OPERATION, GREEDY, TIMING, ABOUT, "summary.json")
+"""Files beside those of the runs; all in a folder belong to one study."""
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]
@@ -134,9 +135,11 @@ class StudyResults(Shown):
         tables |= {RUNS: found.runs, SUMMARY: found.summary, TIMING: _timing(stores)}
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
-        for name, table in tables.items():
-            write_atomically(out / name, to_csv(table))
-        write_atomically(out / ABOUT, json.dumps(about, indent=1, sort_keys=True) + "\n")
+        with staged(out, FILES) as stage:
+            for name, table in tables.items():
+                (stage / name).write_text(to_csv(table), "utf-8")
+            text = json.dumps(about, indent=1, sort_keys=True) + "\n"
+            (stage / ABOUT).write_text(text, "utf-8")
         return found
 
     @property
@@ -582,14 +585,14 @@ def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
         if run.training is not None:
             log = read_table(store.folder / LOG).assign(**key)
             parts[CURVES].append(log)
-            parts[OPERATION] += [log] if run.marks else []
+            parts[OPERATION] += [log] if run.training.marks else []
         online = []
         for file, noise in run.noise.items():
             if noise.whole:
                 continue
             rows = store.measured(file).rename_axis("seed").reset_index()
-            if noise.mark:
-                parts[GREEDY].append(rows.assign(**key, samples=noise.mark))
+            if (mark := run.marks.get(file)) is not None:
+                parts[GREEDY].append(rows.assign(**key, samples=mark))
             elif file == GREEDY:
                 mean = key | {"greedy_J": float(rows.J.mean())}
                 parts[CURVES].append(pd.DataFrame([mean]))
@@ -666,7 +669,7 @@ def study(
     *,
     jobs: int = 1,
     scheduler: str | None = None,
-    progress: Report | bool = False,
+    progress: Progress | bool = False,
     planned: Plan | None = None,
     figures: bool = True,
 ) -> StudyResults:
@@ -679,23 +682,22 @@ def study(
         source: a study, its file, or the same document as a mapping.
         jobs: worker processes; 1 works in this process. No byte of a table depends on it.
         scheduler: address of a Dask scheduler, used in place of `jobs`.
-        progress: a `Report`, called after every work item, and with a line for each run that ends;
-            True draws a bar.
+        progress: a `Progress`, called after every work item, and with a line for each run that
+            ends; True draws a bar.
         planned: the study's plan, if it is known.
         figures: whether the study's trajectories and logs are drawn.
     """
     if isinstance(source, Mapping):
         source = Study.from_dict(source)
     definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
     planned = planned or plan(definition)
-    with reporting(progress, definition.name, planned.samples) as report:
-        runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
+    with holding(folder), reporting(progress, definition.name, planned.samples) as report:
+        runner = Runner(planned.runs, folder, report)
         for line in runner.remarks:
             report(0, "", line)
         runner.run(jobs, scheduler)
-    stores = runner.stores.values()
-    results = StudyResults.written(planned, folder, stores, draw=figures)
+        stores = runner.stores.values()
+        results = StudyResults.written(planned, folder, stores, draw=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
         others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""

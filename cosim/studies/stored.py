@@ -13,6 +13,7 @@ import pandas as pd
 from pydantic import Field
 
 from cosim.errors import ResultsError
+from cosim.evaluation import EVALUATION, TIMING
 from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
 from cosim.studies.document import StudyTable
@@ -30,7 +31,7 @@ from cosim.studies.results import (
     StudyResults,
 )
 from cosim.studies.results import RUNS as RUNS_TABLE
-from cosim.studies.run import EVALUATION, GREEDY, RUNS, TIMING, to_csv
+from cosim.studies.run import GREEDY, RUNS, to_csv
 from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8

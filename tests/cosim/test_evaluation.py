@@ -54,24 +54,19 @@ def test_two_workers_give_the_bytes_of_one(paper):
     assert contents(evaluate(paper, BOTH, 4, 40, jobs=2)) == contents(evaluate(paper, BOTH, 4, 40))
 
 
-def test_a_finished_evaluation_is_read_not_run_again(paper, tmp_path, ledger):
-    first = evaluate(paper, {"noting": noting}, 3, 20, folder=tmp_path / "out")
-    runs = len(ledger())
+def test_every_evaluation_computes_and_writes_its_tables(paper, tmp_path, ledger):
+    first = evaluate(paper, {"noting": noting}, 2, 20, folder=tmp_path / "out")
     again = evaluate(paper, {"noting": noting}, 3, 20, folder=tmp_path / "out")
-    assert (runs, len(ledger())) == (3, 3)
-    assert contents(first) == contents(again)
-    assert first.summary()["timing"] == again.summary()["timing"]
-
-
-def test_more_seeds_run_only_what_is_new(paper, tmp_path, ledger):
-    evaluate(paper, {"noting": noting}, 2, 20, folder=tmp_path / "out")
-    evaluate(paper, {"noting": noting}, 4, 20, folder=tmp_path / "out")
-    assert len(ledger()) == 4
+    assert len(ledger()) == 5
+    assert again.to_pandas()[again.to_pandas().seed < 2].J.tolist() == first.to_pandas().J.tolist()
+    assert (tmp_path / "out" / "evaluation.csv").read_text() == again.to_csv()
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"evaluation.csv", "evaluation.png", "timing.csv", "scenario.toml"}
 
 
 @pytest.mark.slow
-def test_a_killed_worker_loses_nothing(paper, tmp_path, ledger):
-    broken = evaluate(paper, {"mortal": mortal}, 5, 20, folder=tmp_path / "out", jobs=2)
+def test_a_killed_worker_loses_nothing(paper, ledger):
+    broken = evaluate(paper, {"mortal": mortal}, 5, 20, jobs=2)
     assert len(ledger()) > 5, "no run was begun twice, so none was killed"
     whole = evaluate(paper, {"mortal": mortal}, 5, 20)
     assert contents(broken) == contents(whole)

@@ -2,7 +2,9 @@
 
 import errno
 import os
+import signal
 import stat
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +15,7 @@ from cosim.files import (
     read_json,
     read_toml,
     replacing,
+    staged,
     temporary_folder,
     write_atomically,
 )
@@ -123,3 +126,67 @@ def test_a_temporary_folder_is_deleted_with_what_is_in_it_whatever_is_raised(tmp
             assert stat.S_IMODE(folder.stat().st_mode) == 0o700
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
+
+
+# The files of a run ----------------------------------------------------------------------------
+
+OWNED = ("table.csv", "picture.png", "part-*.csv")
+
+
+def _write(folder, names, text):
+    for name in names:
+        (folder / name).write_text(text)
+
+
+def _texts(folder):
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_the_files_of_a_run_appear_together_and_none_of_another_stays(tmp_path):
+    _write(tmp_path, ("table.csv", "picture.png", "part-1.csv", "mine.txt"), "old")
+    with staged(tmp_path, OWNED) as stage:
+        _write(stage, ("table.csv", "part-2.csv"), "new")
+        assert (tmp_path / "table.csv").read_text() == "old"
+    assert _texts(tmp_path) == {"table.csv": "new", "part-2.csv": "new", "mine.txt": "old"}
+
+
+@pytest.mark.parametrize("when", ["while writing", "at the second move"])
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_a_run_that_fails_leaves_the_files_of_the_one_before(tmp_path, monkeypatch, when, error):
+    _write(tmp_path, ("table.csv", "picture.png"), "old")
+    before, replace, moves = _texts(tmp_path), Path.replace, []
+
+    def failing(self, target):
+        moves.append(target)
+        if len(moves) == 2:
+            raise OSError("no")
+        return replace(self, target)
+
+    def run():
+        with staged(tmp_path, OWNED) as stage:
+            _write(stage, ("table.csv", "part-2.csv"), "new")
+            if when == "while writing":
+                raise error
+            monkeypatch.setattr(Path, "replace", failing)
+
+    with pytest.raises((OSError, KeyboardInterrupt)):
+        run()
+    assert _texts(tmp_path) == before
+
+
+@pytest.mark.skipif(not hasattr(os, "kill") or os.name == "nt", reason="signals of POSIX")
+def test_ctrl_c_while_files_are_moved_waits_until_all_are(tmp_path, monkeypatch):
+    replace = Path.replace
+
+    def interrupted(self, target):
+        os.kill(os.getpid(), signal.SIGINT)
+        return replace(self, target)
+
+    def run():
+        with staged(tmp_path) as stage:
+            _write(stage, ("a.csv", "b.csv"), "new")
+            monkeypatch.setattr(Path, "replace", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert _texts(tmp_path) == {"a.csv": "new", "b.csv": "new"}

@@ -81,6 +81,26 @@ def test_other_noise_and_wrong_files_are_named(runs, paper):
         judge(paper, _only(folder, "mine.csv", "mine-4.csv", lambda text: text.replace("P100", "")))
 
 
+def test_what_would_count_twice_or_unlike_is_refused(runs, paper):
+    folder, _ = runs
+    text = (folder / "mine-4.csv").read_text()
+    for name, content, said in (
+        ("copy-4.csv", text, "both of seed 4"),
+        ("short-6.csv", "\n".join(text.splitlines()[:3]), "the same length"),
+    ):
+        (folder / name).write_text(content)
+        with pytest.raises(EvaluationError, match=said):
+            judge(paper, folder)
+        (folder / name).unlink()
+    # Without noise runs on two seeds may be one run.
+    nominal = Scenario.load("nominal")
+    for seed in (4, 5):
+        with FmuPlant(nominal) as plant:
+            simulate(plant, tuned(nominal), 3, seed).write_csv(folder / f"mine-{seed}.csv")
+    with pytest.raises(EvaluationError, match="the same run as"):
+        judge(nominal, folder)
+
+
 def _strong(text):
     head, *rows = text.splitlines()
     return "\n".join([head, *(row.rpartition(",")[0] + ",1e6" for row in rows)])

@@ -1,16 +1,14 @@
-"""Plug-ins by name from the user's folders, what results depend on, and files that hide ours."""
+"""Plug-ins by name from the user's folders, and files that hide our packages."""
 
 import os
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from cosim import Scenario
-from cosim.errors import ControllerLookupError
-from cosim.plugins import build_controller, changed, depends_on, load_plugin, sources_of
+from cosim.plugins import build_controller
 
 ROOT = Path(__file__).parents[2]
 PAPER = Scenario.load("paper")
@@ -55,60 +53,11 @@ def test_a_factory_of_the_working_directory_is_found_and_the_import_path_is_as_b
 def test_the_working_directory_hides_none_of_our_packages(tmp_path, package):
     (tmp_path / "learning").mkdir() if not package else (tmp_path / "learning.py").touch()
     (tmp_path / "mine.py").write_text("import learning\nfound = learning.__file__\n")
-    code = "from cosim.plugins import load_plugin; print(load_plugin('mine:found', 'it', OSError))"
+    code = "from cosim.modules import load_plugin; print(load_plugin('mine:found', 'it', OSError))"
     done = subprocess.run(
         [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert Path(done.stdout.strip()) == ROOT / "learning" / "__init__.py"
-
-
-@pytest.mark.parametrize("edited", ["", "_helper", "_lazy"])
-def test_an_edit_of_the_module_or_of_what_it_imports_is_said_by_name(plugin, tmp_path, edited):
-    name, forget = plugin
-    build_controller(f"{name}:make", PAPER)
-    before = depends_on(PAPER, f"{name}:make")
-    path = tmp_path / f"{name}{edited}.py"
-    path.write_text(path.read_text() + "# edited\n")
-    assert depends_on(PAPER, f"{name}:make") == before  # what was loaded is what computes
-    forget()
-    build_controller(f"{name}:make", PAPER)
-    assert changed(before, depends_on(PAPER, f"{name}:make")) == [path.name]
-
-
-@pytest.mark.parametrize("form", ["{0}_kit.later", "{0}_kit"])
-def test_an_edit_of_a_late_import_is_seen(plugin, tmp_path, monkeypatch, form):
-    name, _ = plugin
-    monkeypatch.syspath_prepend(str(tmp_path))
-    path = tmp_path / f"{name}.py"
-    path.write_text(f"{path.read_text()}def use():\n    import {form.format(name)}\n")
-    (tmp_path / f"{name}_kit").mkdir()
-    for file in ("__init__.py", "later.py"):
-        (tmp_path / f"{name}_kit" / file).write_text("")
-    before = depends_on(PAPER, f"{name}:make")
-    edited = tmp_path / f"{form.format(name).replace('.', '/')}"
-    edited = edited / "__init__.py" if edited.is_dir() else edited.with_suffix(".py")
-    edited.write_text("# edited\n")
-    found = changed(before, depends_on(PAPER, f"{name}:make"))
-    assert found == [edited.relative_to(tmp_path).as_posix()]
-
-
-def test_what_a_result_depends_on_has_names(plugin, tmp_path):
-    name, _ = plugin
-    build_controller(f"{name}:make", PAPER)
-    (tmp_path / "theta.toml").write_text("a = 1\n")
-    found = depends_on(PAPER, "naive", f"{name}:make", "theta.toml")
-    modules = {f"{name}.py", f"{name}_helper.py", f"{name}_lazy.py"}
-    assert found.keys() == {"versions", "rti-cosim", "scenario", "theta.toml", *modules}
-    other = depends_on(Scenario.load("fouled"), "naive", "theta.toml")
-    assert changed(found, other) == sorted(["scenario", *modules])
-
-
-def test_a_class_and_a_partial_have_the_sources_of_their_module(plugin):
-    name, _ = plugin
-    made = load_plugin(f"{name}:Mine", "it", ControllerLookupError)
-    assert set(sources_of(made)) == {f"{name}.py", f"{name}_helper.py"}
-    assert sources_of(partial(build_controller, f"{name}:make")) == sources_of(f"{name}:make")
-    assert sources_of(build_controller) == {}
 
 
 @pytest.mark.parametrize(

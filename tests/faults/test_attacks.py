@@ -144,7 +144,7 @@ NAMES = [".", "..", " ", "", "/etc", "../a", "a/", "a\\b", "C:\\a"]
 def test_a_name_that_leads_elsewhere_is_refused_for_scenarios_and_cases(name):
     for scenario, case in ((name, "q"), ("paper", name)):
         with pytest.raises(StudyError):
-            Run(SimpleNamespace(name=scenario), case, {}, {})
+            Run(SimpleNamespace(scenario=SimpleNamespace(name=scenario)), case, {}, {})
 
 
 # Files ------------------------------------------------------------------------------------------

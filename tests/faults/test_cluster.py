@@ -1,5 +1,6 @@
 """Whatever a Dask address leads to, a run ends, within a time, in results or in one clear line."""
 
+import asyncio
 import json
 import os
 import shutil
@@ -18,8 +19,8 @@ import pytest
 
 from controllers.factories import naive
 from cosim import evaluate
+from cosim import workers as engine
 from cosim.errors import EvaluationError
-from cosim.studies import run as engine
 
 pytest.importorskip("distributed")
 ROOT = Path(__file__).parents[2]
@@ -170,20 +171,26 @@ def test_a_worker_of_another_version_is_named(tmp_path):
 
 
 @SLOW
-@pytest.mark.parametrize("number", ["SIGKILL", "SIGSTOP"])
-def test_a_scheduler_that_ends_or_hangs_ends_the_run_and_loses_nothing(number, tmp_path):
-    rows = tmp_path / "runs" / "paper" / "naive" / "evaluation.csv"
+def test_a_cluster_may_be_used_where_an_event_loop_runs():
+    async def cell(address):
+        return run(address).to_csv()
 
+    with processes() as (address, _):
+        table = asyncio.run(cell(address))
+    assert table == evaluate("paper", {"naive": naive}, 2, 20).to_csv()
+
+
+@SLOW
+@pytest.mark.parametrize("number", ["SIGKILL", "SIGSTOP"])
+def test_a_scheduler_that_ends_or_hangs_ends_the_run_in_a_line(number):
     def stop_later(scheduler):
-        while not rows.exists():
-            time.sleep(0.05)
+        time.sleep(5.0)
         scheduler.send_signal(signal.Signals[number])
 
     with processes() as (address, scheduler):
         stop = threading.Thread(target=stop_later, args=(scheduler,))
         stop.start()
         with pytest.raises(EvaluationError) as caught:
-            run(address, seeds=400, steps=5000, folder=tmp_path)
+            run(address, seeds=4000, steps=5000)
         stop.join()
     assert "\n" not in str(caught.value)
-    assert 1 <= len(rows.read_text().splitlines()) - 1 < 400

@@ -1,9 +1,7 @@
 """Cases beyond those of docs/faults.md: `pytest -m campaign tests/faults` says tried and held."""
 
-import importlib
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,7 +9,6 @@ import pytest
 from cosim import FmuPlant, Scenario, simulate
 from cosim.comparison import compare, load_run
 from cosim.errors import CosimError
-from cosim.plugins import build_controller, changed, depends_on
 from tests.cosim.studies.test_study import contents
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Proportional
@@ -30,47 +27,6 @@ class Mine(Proportional):
         return super().feedback(s)
 def make(scenario): return Mine(scenario)
 """
-
-# How a plug-in reaches the file that is edited between two runs
-AID, KIT, INNER = "mine_aid.py", "mine_kit/__init__.py", "mine_kit/tool.py"
-REACHES = [
-    ("from mine_aid import *", AID),
-    ("import mine_aid as numpy", AID),
-    ("import os, mine_aid", AID),
-    ("import mine_kit.tool", AID),
-    ("import mine_kit.tool", KIT),
-    ("from mine_kit import tool", INNER),
-    ("try:\n    import none_such\nexcept ImportError:\n    import mine_aid", AID),
-    ("if len('a') == 1:\n    import mine_aid", AID),
-    ("import importlib; importlib.import_module('mine_aid')", AID),
-    ("f = lambda m=__import__('mine_aid'): m", AID),
-    ("import sys; sys.path.append('more'); import mine_far", "more/mine_far.py"),
-    ("def b():\n    import mine_aid", AID),
-    ("def b():\n    import mine_kit.tool", INNER),
-    ("def b():\n    from mine_kit import tool", AID),
-    ("import mine_round", "mine_round.py"),
-    ("from mine_aid import Base\nclass More(Base): pass", AID),
-]
-FILES = {AID: "class Base: pass\n", KIT: "", INNER: "from mine_aid import Base\n",
-         "more/mine_far.py": "", "mine_round.py": "import mine_case\n"}  # fmt: skip
-
-
-@pytest.mark.parametrize(("begin", "edited"), REACHES)
-def test_an_edit_is_noticed_however_the_file_is_reached(tmp_path, monkeypatch, begin, edited):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
-    for name, text in (FILES | {"mine_case.py": begin + CONTROLLER.format("pass")}).items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(text)
-    found = []
-    for _ in range(2):
-        for module in [name for name in sys.modules if name.startswith("mine_")]:
-            del sys.modules[module]
-        importlib.invalidate_caches()
-        build_controller("mine_case:make", PAPER)
-        found.append(depends_on(PAPER, "mine_case:make"))
-        (tmp_path / edited).write_text(FILES[edited] + "# edited\n")
-    assert changed(*found) == [edited.removeprefix("more/")]
 
 
 NAMES = ["a\0b", "a\nb", "a\tb", "a:b", "a*b", "a?", 'a"b', "a|b", "<a>", "a.", "a ", " a", "...",

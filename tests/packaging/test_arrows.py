@@ -19,7 +19,7 @@ MAY = {
 HIDDEN = {"controllers": ("cosim.plant", "fmus"), "fmus": ("cosim.plant",)}
 """A controller does not see the plant."""
 GROUND = (
-    "comparison", "environment", "errors", "files", "plugins", "processes", "protocols", "result",
+    "comparison", "environment", "errors", "files", "modules", "plugins", "processes", "protocols", "result",
     "scenario", "simulation", "statistics", "trajectory", "validation",
 )  # fmt: skip
 """Modules of cosim that all packages may import; they import none of controllers and learning."""

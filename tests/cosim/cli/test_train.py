@@ -1,5 +1,4 @@
 import json
-import sys
 
 import pytest
 from PIL import Image
@@ -83,7 +82,7 @@ class Mine(QLearning):
 """
 
 
-def test_a_run_of_an_edited_rule_is_not_resumed(cosim, unwatched, undrawn, monkeypatch, tmp_path):
+def test_a_run_of_an_edited_rule_is_not_resumed(cosim, unwatched, undrawn, tmp_path):
     (tmp_path / "mine.py").write_text(OWN)
     (tmp_path / "helper_of_mine.py").write_text("X = 1\n")
     own = ("train", "-a", "mine:Mine", *SHORT[3:], "--out", "run")
@@ -91,8 +90,6 @@ def test_a_run_of_an_edited_rule_is_not_resumed(cosim, unwatched, undrawn, monke
     assert json.loads((tmp_path / "run/summary.json").read_text())["asks_for"] == "operation"
     assert cosim(*own, "--resume")[0] == 0
     (tmp_path / "helper_of_mine.py").write_text("X = 2\n")
-    for module in ("mine", "helper_of_mine"):  # as in another process
-        monkeypatch.delitem(sys.modules, module, raising=False)
     code, _, err = cosim(*own, "--resume")
-    assert code == 2 and "helper_of_mine.py" in err
+    assert code == 2 and "plug-in mine" in err
     assert len(err.strip().splitlines()) == 1

@@ -1,0 +1,114 @@
+"""What a result depends on: versions, our own code, scenario, FMU, plug-ins and data files."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import cache, partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import ControllerLookupError
+from cosim.modules import OURS, ROOT, TARGET, code_of, forget_users_modules, load_plugin
+from cosim.plant.fmi import unpack
+from cosim.plugins import ALGORITHMS, CONTROLLERS, registered
+from cosim.scenario import Scenario
+
+DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
+SUFFIXES = (".py", ".toml", ".fmu", ".npz", ".c", ".h", ".in")
+ASIDE = {"cli", "figures", "recording", "results", "__pycache__", "report.py", "figures.py"}
+"""Files and folders that bear on no number; `results` is in a wheel only."""
+
+_data: dict[str, str] = {}
+"""Hashes of data files as this process has seen them last, by path."""
+
+
+def depends_on(
+    scenario: Scenario, *parts: Any, files: Mapping[str, str | Path] | None = None
+) -> dict[str, str]:
+    """All that a result depends on, by name: versions as text, everything else as hashes.
+
+    Plug-ins are taken as this process has loaded them, see `cosim.modules.code_of`.
+
+    Args:
+        scenario: the scenario; its FMU and its models count, too.
+        parts: controllers and algorithms: a registered name, `module:Name`, a class or a factory.
+        files: data files by their names in the answer.
+
+    Returns:
+        Words that are equal where the thing is; `cosim.modules.UNKNOWN` where that cannot be known.
+
+    Raises:
+        ControllerLookupError: a part cannot be imported.
+        PlantError: the FMU cannot be read.
+    """
+    data = {name: file_hash(path) or "no file" for name, path in (files or {}).items()}
+    for name, path in (files or {}).items():
+        if _data.setdefault(str(path), data[name]) != data[name]:
+            _data[str(path)] = data[name]
+            forget_users_modules()  # they may have read it while they were imported
+    found = {"versions": versions(), "rti-cosim": code_hash(), "scenario": scenario.hash}
+    found["fmu"] = unpack(scenario.plant.fmu).sha256
+    for part in (scenario.controller.model, scenario.plant.model, *parts):
+        for module in _modules_of(part):
+            if (code := code_of(module)) is not None:
+                found[f"plug-in {module}"] = code
+    return found | data
+
+
+def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Names of what differs between two answers of `depends_on`."""
+    return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+
+
+def _modules_of(part: Any) -> list[str]:
+    """Modules of users and others that hold a part, and the object that it names."""
+    if part is None:
+        return []
+    while isinstance(part, partial):
+        part = part.func
+    if not isinstance(part, str):
+        return [getattr(part, "__module__", None) or type(part).__module__]
+    target = (registered(ALGORITHMS) | registered(CONTROLLERS)).get(part, part)
+    module = target.partition(":")[0]
+    if not TARGET.fullmatch(target) or module.partition(".")[0] in OURS:
+        return []
+    found = load_plugin(target, f"'{part}'", ControllerLookupError)
+    return sorted({module, getattr(found, "__module__", None) or module})
+
+
+def file_hash(path: str | Path) -> str:
+    """SHA-256 of a file, empty where there is none."""
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+@cache
+def versions() -> str:
+    """Versions of Python and of the distributions that results depend on, as one line."""
+    found = [f"python {platform.python_version()}"]
+    for name in DISTRIBUTIONS:
+        with suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    return "; ".join(found)
+
+
+@cache
+def code_hash() -> str:
+    """First 16 hex digits of the SHA-256 of our code that results depend on, C and FMUs included.
+
+    A wheel and a checkout of one commit have the same.
+    """
+    digest = hashlib.sha256()
+    for package in OURS:
+        for path in sorted((ROOT / package).rglob("*")):
+            relative = path.relative_to(ROOT)
+            if path.suffix in SUFFIXES and not ASIDE & set(relative.parts) and path.is_file():
+                digest.update(f"{relative.as_posix()}\0".encode())
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,121 @@
+"""Measurements: a controller on some noise, as an item of work for any process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from controllers import compile_functions
+from cosim.plant import FmuPlant
+from cosim.plugins import ControllerSource
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.simulation import measure, simulate
+from cosim.workers import Item
+
+ITEM = 20_000
+"""Samples of an item, about: a few seconds of work."""
+Factory = Callable[[Scenario], Controller]
+Indicators = dict[str, float]
+
+
+class Noise(NamedTuple):
+    """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`.
+
+    Kept are indicators, or with `whole` every sample of the one seed's run.
+    """
+
+    seeds: tuple[int, ...]
+    steps: int
+    burn_in: int = 0
+    whole: bool = False
+
+    @property
+    def length(self) -> int:
+        """Samples of a run."""
+        return self.burn_in + self.steps
+
+    @property
+    def samples(self) -> int:
+        """Plant samples on all seeds."""
+        return len(self.seeds) * self.length
+
+
+@dataclass
+class Measured:
+    """Indicators and times by noise seed; of one run kept sample by sample its `trajectory`."""
+
+    indicators: dict[int, Indicators] = field(default_factory=dict)
+    timing: dict[int, Indicators] = field(default_factory=dict)
+    trajectory: str = ""
+
+
+@dataclass(frozen=True)
+class MeasureItem(Item[Measured]):
+    """A controller's runs on some noise.
+
+    Attributes:
+        controller: its content, or a factory(scenario).
+        noise: what it meets.
+        length: samples of the longest run whose figures stand beside these. It alone decides
+            whether the controller is compiled, so that no digit depends on the number of seeds.
+        theta: θ in place of the controller's own, (n_θ,); empty for its own.
+        plant: scenario of the plant, where it is another one than the controller's.
+    """
+
+    controller: ControllerSource | Factory
+    noise: Noise
+    length: int
+    theta: tuple[float, ...] = ()
+    plant: Scenario | None = None
+
+    def run(self) -> Measured:
+        """Simulate every seed."""
+        seeds, steps, burn_in, whole = self.noise
+        controller, measured = self._built(), Measured()
+        with FmuPlant(self.plant or self.conditions.scenario) as plant:
+            if whole:
+                return Measured(trajectory=simulate(plant, controller, steps, seeds[0]).to_csv())
+            for seed in seeds:
+                found = measure(plant, controller, seed, steps, burn_in)
+                measured.indicators[seed], measured.timing[seed] = found
+        return measured
+
+    def parts(self) -> Iterator[MeasureItem]:
+        """Items of about `ITEM` samples, the same ones for any number of workers."""
+        seeds, size = self.noise.seeds, max(1, ITEM // self.noise.length)
+        for first in range(0, len(seeds), size):
+            yield replace(self, noise=self.noise._replace(seeds=seeds[first : first + size]))
+
+    def _built(self) -> Controller:
+        if isinstance(self.controller, ControllerSource) and self.controller.theta is not None:
+            return self._with_theta(self.controller)
+        controller = built(self.controller, self.conditions.scenario)
+        compile_functions(controller, self.length)
+        return controller
+
+    def _with_theta(self, source: ControllerSource) -> Controller:
+        """The NMPC of a θ; to build one takes as long as 8000 of its samples."""
+        key = repr((source, sorted(self.conditions.facts.items()), self.length))
+        if key not in _kept:
+            _kept.clear()
+            controller: Any = source.build(self.conditions.scenario)
+            compile_functions(controller, self.length)
+            _kept[key] = controller, controller.theta
+        controller, own = _kept[key]
+        controller.theta = np.array(self.theta) if self.theta else own
+        return controller  # type: ignore[no-any-return]
+
+
+_kept: dict[str, tuple[Any, Any]] = {}
+"""The NMPC that was built last from a θ in this process, and that θ."""
+
+
+def built(controller: ControllerSource | Factory, scenario: Scenario) -> Controller:
+    """The controller for a scenario; raises what building it raises."""
+    if isinstance(controller, ControllerSource):
+        return controller.build(scenario)
+    return controller(scenario)

@@ -1,0 +1,241 @@
+"""Modules of users: where they are searched, how they are loaded, which code was loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import re
+import sys
+import sysconfig
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.metadata import packages_distributions, version
+from pathlib import Path
+from typing import Any
+
+from cosim.processes import watch
+
+TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
+"""Form of an object's name, `module:Name`."""
+OURS = ("fmus", "cosim", "controllers", "learning")
+"""The packages of this distribution; any other is a user's."""
+ROOT = Path(__file__).absolute().parents[1]
+"""Folder that holds them."""
+PYTHON = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
+"""Folders of Python's own modules."""
+INSTALLED = {"site-packages", "dist-packages"}
+"""Names of folders that a package manager fills."""
+UNKNOWN = "cannot be known"
+"""The code of a module without a file, as of a notebook's cell or a script that runs."""
+
+_folders: list[str] = []
+_loaded: dict[Path, str] = {}
+"""Hash of the sources at each place from which a user's module was loaded, as of that time."""
+_lock = threading.RLock()
+
+
+def import_from(folder: str | Path) -> None:
+    """Let `module:Name` name a module of this folder too, in this process.
+
+    Args:
+        folder: the folder, relative to the working directory as it is now.
+    """
+    if (text := str(Path(folder).absolute())) not in _folders:
+        _folders.append(text)
+
+
+def import_folders() -> tuple[str, ...]:
+    """Folders in which users' modules are searched, the working directory last."""
+    folders = dict.fromkeys([*_folders, str(Path.cwd())])
+    return tuple(folder for folder in folders if Path(folder) != ROOT)
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Let import statements find modules of `import_folders`, after all others."""
+    with _lock:
+        added = [folder for folder in import_folders() if folder not in sys.path]
+        for package in OURS:  # a folder of such a name would be found before an editable install
+            names = [Path(folder) / f"{package}{end}" for folder in added for end in ("", ".py")]
+            if any(name.exists() for name in names):
+                importlib.import_module(package)
+        sys.path.extend(added)
+        importlib.invalidate_caches()
+        try:
+            yield
+        finally:
+            for folder in added:
+                with suppress(ValueError):
+                    sys.path.remove(folder)
+
+
+def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
+    """Import an object by its name; a module that was edited since it was loaded is loaded anew.
+
+    Args:
+        target: the object as `module:Name`; the module may lie in one of `import_folders`.
+        what: what it is, for messages.
+        error: class of the exception that is raised.
+
+    Returns:
+        The object.
+
+    Raises:
+        error: the text has another form, two different files have the module's name, the import
+            fails, or the module has no such name.
+    """
+    if not TARGET.fullmatch(target):
+        raise error(f"{what} must be given as module:Name, not '{target}'")
+    module, _, attribute = target.partition(":")
+    foreign = module.partition(".")[0] not in OURS
+    if foreign:
+        watch(f"plug-in '{target}'")
+    try:
+        with importing():
+            if foreign:
+                _forget_edited_modules()
+            found: Any = importlib.import_module(module)
+            if foreign and (place := _place(module)) is not None:
+                _loaded.setdefault(place, _sources_hash(place))
+        for part in attribute.split("."):
+            found = getattr(found, part)
+    # A module may raise anything while it is imported, and one that is a script may even exit.
+    except (Exception, SystemExit) as cause:
+        raise error(f"{what} cannot be imported: {exception_line(cause)}") from cause
+    if foreign and (others := _others_of_that_name(module)):
+        raise error(
+            f"{what}: two files have the name of its module, '{others[0]}' and '{others[1]}'; "
+            "rename one of them, or use each in a process of its own"
+        )
+    return found
+
+
+def exception_line(cause: BaseException) -> str:
+    """The exception, its file and its line, as one line of text."""
+    said = str(cause) if isinstance(cause, ImportError) else f"{type(cause).__name__}: {cause}"
+    frames = [
+        frame
+        for frame in traceback.extract_tb(cause.__traceback__)
+        if not frame.filename.startswith("<frozen") and Path(frame.filename) != Path(__file__)
+    ]
+    where = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    return f"{' '.join(said.split())}{where}"
+
+
+def code_of(module: str) -> str | None:
+    """The code of a loaded module in words that are equal where the code is.
+
+    They hold the distribution with its version, where the module is installed, and a hash of the
+    Python files of its package, or of its folder and the packages in it, as they were when this
+    process loaded the module. Files elsewhere, and data, are not part of it.
+
+    Args:
+        module: full name of the module.
+
+    Returns:
+        The words; `UNKNOWN` of a module without a file; None of our own modules and of Python's.
+    """
+    top = module.partition(".")[0]
+    if top in OURS or top in sys.builtin_module_names:
+        return None
+    place = _place(module)
+    if place is None:
+        return UNKNOWN
+    installed = bool(INSTALLED & set(place.parts))
+    if not installed and any(place.is_relative_to(folder) for folder in PYTHON):
+        return None
+    code = _loaded.setdefault(place, _sources_hash(place))
+    names = _distributions().get(top, []) if installed else []
+    return " ".join([*(f"{name} {version(name)}" for name in names), code])
+
+
+@cache
+def _distributions() -> dict[str, list[str]]:
+    """Installed distributions by the modules that they hold."""
+    return {module: sorted(set(names)) for module, names in packages_distributions().items()}
+
+
+def _place(module: str) -> Path | None:
+    """Where a loaded module's sources are: a folder, or an installed package or file.
+
+    None of a module without a file, and of the script that runs, which was read at its start.
+    """
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if module == "__main__" or not isinstance(file, str) or not Path(file).is_file():
+        return None
+    path = Path(file).absolute()
+    inner = module.count(".") + (path.stem == "__init__")
+    folder = path.parents[inner]
+    if folder.name not in INSTALLED:
+        return folder
+    return path if not inner else path.parents[inner - 1]
+
+
+def _forget_edited_modules() -> None:
+    """Remove the modules of places whose sources have changed since, so that they load anew."""
+    for place, code in list(_loaded.items()):
+        if _sources_hash(place) != code:
+            _forget(place)
+
+
+def forget_users_modules() -> None:
+    """Remove all modules of users, so that they load anew and read their data files again."""
+    for place in list(_loaded):
+        _forget(place)
+
+
+def _forget(place: Path) -> None:
+    del _loaded[place]
+    for name in list(sys.modules):
+        if name.partition(".")[0] not in OURS and _place(name) == place:
+            del sys.modules[name]
+
+
+def _others_of_that_name(module: str) -> list[Path]:
+    """Places of a loaded module and of another one of that name in `import_folders`, or []."""
+    place, top = _place(module), module.partition(".")[0]
+    if place is None:
+        return []
+    for folder in map(Path, import_folders()):
+        there = (folder / f"{top}.py").is_file() or (folder / top / "__init__.py").is_file()
+        if there and not folder.samefile(place) and _sources_hash(folder) != _sources_hash(place):
+            return [place / top, folder / top]
+    return []
+
+
+def _sources_hash(place: Path) -> str:
+    """First 16 hex digits of the SHA-256 of a place's Python files, with their names."""
+    digest = hashlib.sha256()
+    files = [place] if place.is_file() else _python_files(place, set())
+    for path in files:
+        with suppress(OSError):
+            content = hashlib.sha256(path.read_bytes()).digest()
+            name = path.relative_to(place).as_posix()
+            digest.update(f"{name}\0".encode(errors="surrogateescape") + content)
+    return digest.hexdigest()[:16]
+
+
+def _python_files(folder: Path, seen: set[Path]) -> Iterator[Path]:
+    """Modules of a folder, compiled ones too, and those of the folders in it that hold any."""
+    if (real := folder.resolve()) in seen:
+        return
+    seen.add(real)
+    with suppress(OSError):
+        entries = sorted(folder.iterdir())
+        modules = [path for path in entries if path.name.endswith((".py", *EXTENSION_SUFFIXES))]
+        if not modules and len(seen) > 1:
+            return
+        yield from (path for path in modules if path.is_file())
+        for path in entries:
+            ours = folder == ROOT and path.name in OURS
+            if (
+                path.is_dir()
+                and path.name.isidentifier()
+                and path.name != "__pycache__"
+                and not ours
+            ):
+                yield from _python_files(path, seen)

@@ -1,0 +1,299 @@
+"""Work given out: to this process, to several, or to the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Generator, Hashable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Generic, Self, TypeVar
+
+import loky
+
+from cosim.errors import EvaluationError
+from cosim.identity import changed, depends_on
+from cosim.modules import OURS, import_folders, import_from
+from cosim.processes import Terminated, follow_parent, without_interrupts
+from cosim.scenario import Scenario, is_file
+from cosim.validation import whole_number
+
+ANSWER_SECONDS = 10.0
+"""Time in which a scheduler answers."""
+WORKER_SECONDS = 300.0
+"""Time for which a cluster may be without a worker while there is work."""
+ROUNDS = 3
+"""Times that workers may die without having finished one item."""
+Key = TypeVar("Key", bound=Hashable)
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A failed item: message, traceback, and the class of our own errors."""
+
+    message: str
+    traceback: str
+    kind: type[Exception] | None = None
+
+    def error(self) -> Exception:
+        """The error once more; an EvaluationError for that of a plug-in."""
+        if self.kind is not None and self.kind.__init__ is Exception.__init__:
+            return self.kind(self.message.partition(": ")[2])
+        return EvaluationError(self.message)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What an item of work was planned with, and what a worker must find.
+
+    Attributes:
+        scenario: the whole scenario, with the FMU's absolute path.
+        facts: `depends_on` of the scenario, the parts and the files where the work was planned.
+        parts: controllers and algorithms that count.
+        files: paths of the data files that count, by name.
+        folders: where users' modules are searched.
+    """
+
+    scenario: Scenario
+    facts: Mapping[str, str]
+    parts: tuple[Any, ...]
+    files: Mapping[str, str]
+    folders: tuple[str, ...]
+
+    @classmethod
+    def of_now(
+        cls, scenario: Scenario, *parts: Any, files: Mapping[str, str] | None = None
+    ) -> Self:
+        """The conditions as this process finds them now; raises what `depends_on` raises."""
+        if is_file(scenario.plant.fmu):
+            fmu = str(Path(scenario.plant.fmu).resolve())
+            scenario = scenario.replace({"plant": {"fmu": fmu}})
+        facts = depends_on(scenario, *parts, files=files)
+        return cls(scenario, facts, parts, files or {}, import_folders())
+
+    def found_here(self) -> dict[str, str]:
+        """What this process finds in the place of `facts`."""
+        for folder in self.folders:
+            import_from(folder)
+        return depends_on(self.scenario, *self.parts, files=self.files)
+
+    def refusal(self, found: Mapping[str, str]) -> Failure | None:
+        """The failure of a worker that has found other things than planned; None if it has not."""
+        names = changed(self.facts, found)
+        if not names:
+            return None
+        seen = [f"{name} ({found.get(name)}, not {self.facts.get(name)})" for name in names]
+        if "fmu" in names:
+            seen.append(f"the FMU is '{self.scenario.plant.fmu}'")
+        message = (
+            "EvaluationError: a worker ran with other things than the work was planned with: "
+            f"{'; '.join(seen)}; give the command again with the same everywhere"
+        )
+        return Failure(message, f"{message}\n", EvaluationError)
+
+
+@dataclass(frozen=True)
+class Item(Generic[Result]):
+    """A unit of work of one process, whole by its content; `run` does it."""
+
+    conditions: Conditions
+
+    def run(self) -> Result:
+        """Do the work."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Report(Generic[Result]):
+    """What a worker says of an item: what it ran with, and the result or the failure."""
+
+    found: Mapping[str, str]
+    result: Result | Failure
+
+
+def perform(item: Item[Result]) -> Report[Result]:
+    """Do an item in this process; any exception, `sys.exit` too, becomes a Failure."""
+    found: Mapping[str, str] = {}
+    try:
+        found = item.conditions.found_here()
+        if (refusal := item.conditions.refusal(found)) is not None:
+            return Report(found, refusal)
+        result = item.run()
+        # Data files and plug-ins may have been edited meanwhile.
+        return Report(item.conditions.found_here(), result)
+    except (KeyboardInterrupt, Terminated):
+        raise
+    except BaseException as error:
+        text = " ".join(f"{error}".split()) or type(error).__name__
+        kind = type(error) if isinstance(error, Exception) else None
+        if kind is not None and kind.__module__.partition(".")[0] not in OURS:
+            kind = None
+        message = f"{type(error).__name__}: {text}"
+        return Report(found, Failure(message, traceback.format_exc(), kind))
+
+
+def done(
+    items: Mapping[Key, Item[Result]], jobs: int, scheduler: str | None
+) -> Iterator[tuple[Key, Result | Failure]]:
+    """Do items; yield the key of each with its result as it ends, in no certain order.
+
+    What a worker has found is compared with the item's facts; a result of others is a Failure.
+    Items of workers that died are given out again.
+
+    Args:
+        items: the items by key.
+        jobs: worker processes; 1 works in this process.
+        scheduler: address of a Dask scheduler, used in place of `jobs`.
+
+    Yields:
+        The key of an item, and its result or its failure.
+
+    Raises:
+        EvaluationError: no worker can work.
+    """
+    jobs = whole_number("jobs", jobs, 1, EvaluationError)
+    left, fruitless = dict(items), 0
+    while left:
+        fruitless += 1
+        try:
+            with closing(_reports(left, jobs, scheduler)) as reports:
+                for key, report in reports:
+                    conditions, fruitless = left.pop(key).conditions, 0
+                    if isinstance(report.result, Failure):
+                        yield key, report.result
+                    else:
+                        yield key, conditions.refusal(report.found) or report.result
+        except BrokenProcessPool as error:
+            if fruitless == ROUNDS:
+                raise EvaluationError(
+                    f"the workers died {ROUNDS} times without finishing one of the work "
+                    f"items left ({error}); run with --jobs 1 to see why"
+                ) from None
+
+
+def begin(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and end with it."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    follow_parent(parent)
+
+
+def _with_key(key: Key, item: Item[Result]) -> tuple[Key, Report[Result]]:
+    return key, perform(item)
+
+
+def _reports(
+    items: Mapping[Key, Item[Result]], jobs: int, scheduler: str | None
+) -> Generator[tuple[Key, Report[Result]], None, None]:
+    """Reports of items by key, in no certain order."""
+    if scheduler is not None:
+        yield from _on_cluster(scheduler, items)
+        return
+    if jobs == 1:
+        yield from (_with_key(key, item) for key, item in list(items.items()))
+        return
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    workers = loky.ProcessPoolExecutor(
+        min(jobs, len(items)), initializer=begin, initargs=(os.getpid(),), env=one_thread
+    )
+    try:
+        with without_interrupts():
+            ended = [workers.submit(_with_key, *pair) for pair in items.items()]
+        for future in loky.as_completed(ended):
+            yield future.result()
+    finally:
+        workers.shutdown(wait=True, kill_workers=True)
+
+
+def _on_cluster(
+    address: str, items: Mapping[Key, Item[Result]]
+) -> Iterator[tuple[Key, Report[Result]]]:
+    """Run items on an existing scheduler's workers; yield their reports as they end.
+
+    Raises EvaluationError where the scheduler fails, is silent or has no worker, and where a worker
+    cannot do an item.
+    """
+    try:
+        dask: Any = import_module("distributed")
+    except ImportError:
+        raise EvaluationError(
+            "a Dask scheduler needs the extra 'cluster': pip install 'rti-cosim[cluster]'"
+        ) from None
+    ended: SimpleQueue[Any] = SimpleQueue()
+    level = logging.root.manager.disable
+    logging.disable()  # the exception says what went wrong, once
+    try:
+        # Ask the address first: a client made where nobody answers can hang when it ends.
+        if _identity(dask, address).get("type") != "Scheduler":
+            raise OSError("what answers is no scheduler")
+        client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
+        try:
+            for future in client.map(_with_key, *zip(*items.items(), strict=True), pure=False):
+                future.add_done_callback(ended.put)
+            for _ in range(len(items)):
+                yield _next_ended(dask, address, ended).result()
+        finally:
+            with suppress(Exception):
+                client.close(timeout=ANSWER_SECONDS)
+    except Exception as error:
+        text = f"no answer within {ANSWER_SECONDS:g} s" if type(error) is TimeoutError else error
+        said = " ".join(str(text).split())[:300] or type(error).__name__
+        raise EvaluationError(
+            f"the Dask cluster at '{address}' failed: {said}; give the same command again, with "
+            "the same rti-cosim and what the items need on all workers"
+        ) from None
+    finally:
+        logging.disable(level)
+
+
+def _next_ended(dask: Any, address: str, ended: SimpleQueue[Any]) -> Any:
+    """The next future that has ended; raises OSError where there is no worker for long."""
+    waited = 0.0
+    while True:
+        with suppress(Empty):
+            return ended.get(timeout=ANSWER_SECONDS)
+        waited = 0.0 if _identity(dask, address)["workers"] else waited + ANSWER_SECONDS
+        if waited > WORKER_SECONDS:
+            raise OSError(f"it has had no worker for {WORKER_SECONDS:g} s")
+
+
+def _identity(dask: Any, address: str) -> dict[str, Any]:
+    """A scheduler's identity; raises TimeoutError without an answer."""
+    import asyncio  # noqa: PLC0415 - of no use to a worker
+
+    async def ask() -> dict[str, Any]:
+        security = dask.Security().get_connection_args("client")
+        async with (
+            asyncio.timeout(ANSWER_SECONDS),
+            dask.rpc(address, connection_args=security) as scheduler,
+        ):
+            return dict(await scheduler.identity())
+
+    return _in_a_thread(lambda: asyncio.run(ask()))
+
+
+def _in_a_thread(function: Callable[[], Result]) -> Result:
+    """Call a function in a thread of its own: a notebook's has an event loop that runs already."""
+    results: list[Result] = []
+    errors: list[BaseException] = []
+
+    def call() -> None:
+        try:
+            results.append(function())
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]
+    return results[0]

@@ -19,8 +19,8 @@ MAY = {
 HIDDEN = {"controllers": ("cosim.plant", "fmus"), "fmus": ("cosim.plant",)}
 """A controller does not see the plant."""
 GROUND = (
-    "comparison", "environment", "errors", "files", "modules", "plugins", "processes", "protocols", "result",
-    "scenario", "simulation", "statistics", "trajectory", "validation",
+    "comparison", "environment", "errors", "files", "modules", "plugins", "processes", "protocols",
+    "result", "scenario", "simulation", "statistics", "trajectory", "validation",
 )  # fmt: skip
 """Modules of cosim that all packages may import; they import none of controllers and learning."""
 ABOVE = ("controllers", "learning", "fmus", "cosim.cli", "cosim.evaluation", "cosim.studies")

@@ -21,6 +21,10 @@ class CapabilityError(PlantError):
     """A capability was asked for that this FMU does not have, e.g. saving its state."""
 
 
+class FmuWarning(UserWarning):
+    """An FMU is used although its model description has flaws."""
+
+
 class ControllerLookupError(CosimError):
     """A controller's name, `module:factory` or parameters file that leads nowhere."""
 

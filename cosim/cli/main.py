@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import traceback
+import warnings
 from inspect import getdoc
 from itertools import pairwise
 from typing import Annotated, Any
@@ -29,7 +30,7 @@ from cosim.cli import (
     train,
     view,
 )
-from cosim.errors import CosimError
+from cosim.errors import CosimError, FmuWarning
 from cosim.files import protect
 from cosim.processes import Finished, Interrupted, Terminated, command_process, unwound
 
@@ -199,7 +200,24 @@ def _open_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+_format_warning = warnings.formatwarning
+
+
+def _one_line(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """Text of a warning: one line, as errors are, where it is meant for the user."""
+    if not issubclass(category, FmuWarning):
+        return _format_warning(message, category, filename, lineno, line)
+    return f"warning: {' '.join(str(message).split())}\n"
+
+
 def _run() -> None:
+    warnings.formatwarning = _one_line
     try:
         app()
     except (SystemExit, Finished) as error:

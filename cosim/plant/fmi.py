@@ -5,11 +5,13 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import itertools
+import multiprocessing
 import os
 import shutil
 import stat
 import sys
 import threading
+import warnings
 import zipfile
 from abc import ABC, abstractmethod
 from collections import Counter, deque
@@ -17,7 +19,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from math import inf
+from math import inf, isnan
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
@@ -31,7 +33,7 @@ from fmpy.model_description import read_model_description
 from numpy.typing import NDArray
 
 import fmus
-from cosim.errors import CapabilityError, PlantError
+from cosim.errors import CapabilityError, FmuWarning, PlantError
 from cosim.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
 
@@ -50,6 +52,8 @@ class UnpackedFmu:
     folder: Path
     description: Any
     entries: frozenset[str]
+    flaws: tuple[str, ...] = ()
+    """What the model description has against FMI's schema and rules, none of which bars a run."""
 
     @cached_property
     def variables(self) -> dict[str, Any]:
@@ -66,6 +70,47 @@ class UnpackedFmu:
         variable = self.variable(name)
         stated = variable and (variable.unit or getattr(variable.declaredType, "unit", None))
         return str(stated or "")
+
+    def range(self, name: str) -> tuple[float, float]:
+        """Least and greatest value of a variable, as it or its type states; ±∞ without a bound.
+
+        Tools write numbers for "no bound": 1e60 (Modelica's infinity), DBL_MAX, 1e30, the ends of
+        an integer's type. A bound `NO_BOUND` times as large as the variable's scale is none.
+        """
+        variable = self.variable(name)
+        declared = getattr(variable, "declaredType", None)
+        scale = max(
+            1.0,
+            *(abs(number(getattr(variable, field, None), 0.0)) for field in ("start", "nominal")),
+        )
+        limits = []
+        for field, none in (("min", -inf), ("max", inf)):
+            stated = getattr(variable, field, None)
+            if stated is None:
+                stated = getattr(declared, field, None)
+            limit = number(stated, none)
+            is_end = variable is not None and variable.type not in _REALS and limit in _ENDS
+            limits.append(none if is_end or not abs(limit) < NO_BOUND * scale else limit)
+        return limits[0], limits[1]
+
+
+NO_BOUND = 1e15
+"""Ratio of a bound to a variable's scale from which it is none: a double has 15 digits."""
+_REALS = ("Real", "Float64", "Float32")
+_ENDS = {
+    float(end)
+    for bits in (8, 16, 32, 64)
+    for end in (-(1 << bits - 1), (1 << bits - 1) - 1, (1 << bits) - 1)
+}
+
+
+def number(stated: str | float | None, otherwise: float) -> float:
+    """A number as a model description states it; `otherwise` where it states none or no number."""
+    try:
+        found = otherwise if stated is None else float(stated)
+    except ValueError:
+        return otherwise
+    return otherwise if isnan(found) else found
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
@@ -117,7 +162,8 @@ def _unpack(path: Path) -> UnpackedFmu:
         raise PlantError(
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
-    return UnpackedFmu(path, digest, folder, _describe(path, folder), entries)
+    description, flaws = _describe(path, folder)
+    return UnpackedFmu(path, digest, folder, description, entries, flaws)
 
 
 def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
@@ -147,17 +193,64 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
     archive.NameToInfo = {entry.filename: entry for entry in entries}
 
 
-def _describe(path: Path, folder: Path) -> Any:
+def _describe(path: Path, folder: Path) -> tuple[Any, tuple[str, ...]]:
+    """The model description, and what it has against FMI's rules; a warning names those, once.
+
+    A description that can be read in spite of its flaws is read. Raises PlantError where it cannot,
+    or where a plant cannot be made of it.
+    """
+    flaws: tuple[str, ...] = ()
     try:
         description = read_model_description(str(folder))
     # fmpy's ValidationError, its bare Exception, and lxml's errors on text that is not XML.
     except Exception as error:
-        first, *others = getattr(error, "problems", [error])
-        more = f" ({len(others)} more)" if others else ""
-        raise PlantError(f"FMU '{path}' has an invalid model description: {first}{more}") from None
+        problems = getattr(error, "problems", [error])
+        flaws = tuple(" ".join(str(problem).split()) for problem in problems)
+        description = _describe_leniently(path, folder, flaws)
     if description.fmiVersion[:2] not in ("2.", "3."):
         raise PlantError(f"FMU '{path}' is FMI {description.fmiVersion}; 2.0 and 3.0 are supported")
+    return description, flaws
+
+
+def _describe_leniently(path: Path, folder: Path, flaws: tuple[str, ...]) -> Any:
+    """The description of an FMU that failed the validation, with a warning that names the flaws.
+
+    Raises PlantError where it cannot be read, or lacks what a run needs.
+    """
+    more = f" ({len(flaws) - 1} more)" if len(flaws) > 1 else ""
+    what_is_wrong = f"{flaws[0]}{more}"
+    try:
+        # By the file's own path, sources/buildDescription.xml is left alone.
+        description = read_model_description(str(folder / DESCRIPTION), validate=False)
+        obstacle = _obstacle(description)
+    except Exception:
+        obstacle = what_is_wrong
+    if obstacle:
+        raise PlantError(f"FMU '{path}' has an invalid model description: {obstacle}")
+    # A worker process need not repeat it.
+    if multiprocessing.parent_process() is None:
+        warnings.warn(
+            f"FMU '{path.name}' is used although its model description is flawed: {what_is_wrong}; "
+            "`cosim fmu check` lists what it found",
+            FmuWarning,
+            stacklevel=2,
+        )
     return description
+
+
+def _obstacle(description: Any) -> str:
+    """What bars any run of a description that failed its validation; empty if nothing does."""
+    interface = description.coSimulation
+    if not isinstance(description.guid, str):
+        return "it has no guid (FMI 3.0: instantiationToken)"
+    if interface is not None and not isinstance(interface.modelIdentifier, str):
+        return "its co-simulation has no modelIdentifier"
+    places: dict[str, tuple[int, str]] = {}
+    for variable in description.modelVariables:
+        place = variable.valueReference, variable.type
+        if places.setdefault(variable.name, place) != place:
+            return f"two variables are called '{variable.name}'"
+    return ""
 
 
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
@@ -213,23 +306,35 @@ def library_path(fmu: UnpackedFmu) -> Path:
     folders = [platform.folder(version)]
     if version.startswith("2") and platform.tuple in _FALLBACKS:
         folders.append(_FALLBACKS[platform.tuple])
-    others = []
+    reasons = []
     for folder in folders:
         entry = f"binaries/{folder}/{identifier}{fmpy.sharedLibraryExtension}"
         if entry not in fmu.entries:
+            reasons += _instead(fmu, folder, entry)
             continue
         path = fmu.folder / entry
         made_for = platforms_of(path.read_bytes())
         if platform.tuple in made_for:
             return path
         what = f"made for {' and '.join(made_for)}" if made_for else "not a shared library"
-        others.append(f"its '{entry}' is {what}")
-    found = {name.split("/")[1] for name in fmu.entries if name.startswith("binaries/")} - {""}
-    why = "; ".join(others) or f"it has: {', '.join(sorted(found)) or 'none'}"
+        reasons.append(f"its '{entry}' is {what}")
+    files = [name.split("/") for name in fmu.entries if not name.endswith("/")]
+    filled = {parts[1] for parts in files if parts[0] == "binaries" and len(parts) > 2}
+    why = "; ".join(reasons) or f"it has: {', '.join(sorted(filled)) or 'none'}"
     raise PlantError(
         f"FMU '{fmu.path}' has no binary for {platform.tuple} ({why}); build one from its sources, "
         "the shipped FMU's by `cosim fmu build --out DIR` with a C compiler, and name that file"
     )
+
+
+def _instead(fmu: UnpackedFmu, folder: str, entry: str) -> list[str]:
+    """What a platform's folder has in place of the library; nothing where there is no folder."""
+    prefix = f"binaries/{folder}/"
+    inside = sorted(name for name in fmu.entries if name.startswith(prefix))
+    names = [name.removeprefix(prefix) for name in inside if not name.endswith("/")]
+    if names:
+        return [f"its '{prefix}' has {', '.join(names[:5])} and no {entry.removeprefix(prefix)}"]
+    return [f"its '{prefix}' is empty"] if inside else []
 
 
 WARNING, DISCARD, FATAL = 1, 2, 4

@@ -17,6 +17,7 @@ from cosim.plant.fmi import (
     Place,
     UnpackedFmu,
     library_path,
+    number,
     unpack,
 )
 from cosim.scenario import PlantTable, Scenario
@@ -45,7 +46,7 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
             library_path(fmu)
         except PlantError as error:
             yield str(error)
-        internal = float(simulation.fixedInternalStepSize or 0)
+        internal = number(simulation.fixedInternalStepSize, 0.0)
         count = step / internal if step and internal > 0 else 1.0
         if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
             yield (
@@ -87,8 +88,8 @@ def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
     A default stop time is left out: a run may well go on beyond it.
     """
     default = fmu.description.defaultExperiment
-    start = float(getattr(default, "startTime", None) or 0.0)
-    tolerance = float(getattr(default, "tolerance", None) or 0.0) or None
+    start = number(getattr(default, "startTime", None), 0.0)
+    tolerance = number(getattr(default, "tolerance", None), 0.0) or None
     if plant is None:
         return Experiment(start, None, tolerance)
     if plant.start_time is not None:
@@ -193,7 +194,7 @@ class Wiring:
         if what:
             raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
         stated = ["0"] if variable.type in _NO_NUMBERS else str(variable.start or 0).split()
-        starts = tuple(map(float, stated)) * (prod(shape) // len(stated))
+        starts = tuple(number(text, 0.0) for text in stated) * (prod(shape) // len(stated))
         return Place(int(variable.valueReference), str(variable.type), index, starts)
 
 
@@ -222,15 +223,15 @@ def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
     Raises PlantError for anything but an integer in [0, 2⁶⁴).
     """
     try:
-        number = operator.index(seed)
+        integer = operator.index(seed)
     except TypeError:
-        number = -1
-    if not 0 <= number < 1 << 64:
+        integer = -1
+    if not 0 <= integer < 1 << 64:
         raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
     words, shift = [], 0
     for place in places:
         bits = 64 if place.type in _WIDE else 32
-        words.append((place, number >> shift & (1 << bits) - 1))
+        words.append((place, integer >> shift & (1 << bits) - 1))
         shift += bits
     return words
 

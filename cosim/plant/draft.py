@@ -158,7 +158,7 @@ def first_document(
     if "nominal" in mapping and "ranges" in mapping:
         disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
         for field in ("nominal", "ranges"):
-            disturbance[field] = [_start(archive, name) for name in mapping[field]]
+            disturbance[field] = [start_value(archive, name) for name in mapping[field]]
     return {
         "schema": 1,
         "name": archive.path.stem if str(fmu) not in SHIPPED else str(fmu),
@@ -219,10 +219,10 @@ def _starts(fmu: UnpackedFmu, names: Sequence[str], given: Sequence[float], kind
         raise PlantError(
             f"--{kind} takes {len(names)} numbers ({', '.join(names)}), not {len(given)}"
         )
-    return np.array(given or [_start(fmu, name) for name in names], dtype=float)
+    return np.array(given or [start_value(fmu, name) for name in names], dtype=float)
 
 
-def _start(fmu: UnpackedFmu, name: str) -> float:
+def start_value(fmu: UnpackedFmu, name: str) -> float:
     """Start value of a variable or an array's element; 0 where the FMU states none."""
     variable = fmu.variable(name)
     stated = str(getattr(variable, "start", None) or "").split()
@@ -247,7 +247,7 @@ def action_limits(fmu: UnpackedFmu, name: str, value: float) -> tuple[float, flo
 
 def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
     experiment = getattr(fmu.description.defaultExperiment, "stepSize", None)
-    stated = _start(fmu, mapping.get("sampling_time", "")) or number(experiment, 0.0)
+    stated = start_value(fmu, mapping.get("sampling_time", "")) or number(experiment, 0.0)
     if not stated > 0:
         raise PlantError(f"FMU '{fmu.path.name}' states no step size; give --sampling-time SECONDS")
     return stated

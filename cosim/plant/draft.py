@@ -18,8 +18,9 @@ from scipy.optimize import least_squares
 from cosim.errors import PlantError
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
+from cosim.plant.probe import AFTER, Kind, Report, Restart, probe
 from cosim.plant.starts import start_parameters
-from cosim.plant.wiring import INTEGERS, REALS, refusals
+from cosim.plant.wiring import INTEGERS, NO_NUMBERS, REALS, refusals
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -79,6 +80,39 @@ def guess_roles(
     )
 
 
+def number_roles(
+    fmu: UnpackedFmu,
+    states: Sequence[str] = (),
+    actions: Sequence[str] = (),
+    stage_cost: str | None = None,
+) -> Roles:
+    """Roles to try an FMU with where nobody can guess them; of an array its first element.
+
+    Args:
+        fmu: An FMU that is not refused.
+        states: States, if known; else all numbers among the outputs, else among the locals.
+        actions: Actions, if known; else all numbers among the inputs, else a tunable parameter.
+        stage_cost: Stage cost, if known; else the first of these states.
+    """
+
+    def names(causality: str, variability: str = "") -> tuple[str, ...]:
+        return tuple(
+            elements(variable)[0]
+            for variable in fmu.variables.values()
+            if variable.causality == causality
+            and variable.variability in (variability or variable.variability,)
+            and variable.type not in NO_NUMBERS
+        )
+
+    tried_states = tuple(states) or names("output") or names("local")
+    return Roles(
+        states=tried_states,
+        actions=tuple(actions) or names("input") or names("parameter", "tunable")[:1],
+        disturbances=(),
+        stage_cost=stage_cost or tried_states[0],
+    )
+
+
 def draft_scenario(
     fmu: str | Path,
     target: Path,
@@ -113,7 +147,8 @@ def draft_scenario(
         raise PlantError(refusal)
     roles = guess_roles(archive, states, actions, stage_cost)
     document = first_document(fmu, archive, roles, sampling_time, action)
-    document, remarks = _with_starts(document, archive, state)
+    document, remarks = _with_what_was_seen(document, archive)
+    document, more_remarks = _with_starts(document, archive, state)
     undisturbed = document | {"disturbance": {"law": "none"}}
     with FmuPlant(Scenario.from_dict(undisturbed)) as plant:
         x, u, cost = nearest_steady_state(
@@ -132,7 +167,8 @@ def draft_scenario(
         with suppress(ValueError):  # it is on another drive
             path = os.path.relpath(archive.path, target.resolve().parent)
             document["plant"]["fmu"] = Path(path).as_posix()
-    return with_remarks(tomli_w.dumps(document), _remarks(document, archive, units) | remarks)
+    remarks = _remarks(document, archive, units) | remarks | more_remarks
+    return with_remarks(tomli_w.dumps(document), remarks)
 
 
 def first_document(
@@ -184,6 +220,61 @@ def first_document(
         "penalty": {"linear": [1.0] * n, "quadratic": [1.0] * n},
         "controller": _reference(np.zeros(n), u, 0.0),
     }
+
+
+def _with_what_was_seen(
+    document: dict[str, Any], archive: UnpackedFmu
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The document with what a probe of the FMU found, and remarks on it.
+
+    Only what differs from a scenario's defaults is written: outputs that doStep computes, the
+    start time and tolerance that the file states, a stop time without which it does not run.
+    """
+    quiet = document | {"disturbance": {"law": "none"}}
+    report = probe(Scenario.from_dict(quiet))
+    plant, remarks = dict(document["plant"]), {}
+    mapping = plant.pop("mapping")  # it stands last
+    if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
+        plant["outputs"] = report.outputs
+        remarks["plant.outputs"] = _outputs_remark(report)
+    experiment = report.experiment
+    if experiment.start_time != 0.0:
+        plant["start_time"] = experiment.start_time
+        remarks["plant.start_time"] = "s; the FMU's own; CHECK: the time at which a run begins"
+    if experiment.stop_time is not None:
+        plant["stop_time"] = experiment.stop_time
+        remarks["plant.stop_time"] = (
+            "s; the FMU's own, without which it does not run; CHECK: no run goes beyond it"
+        )
+    if experiment.tolerance is not None:
+        plant["tolerance"] = experiment.tolerance
+        remarks["plant.tolerance"] = "relative, of the FMU's solver; the FMU's own"
+    switches = [name for name in report.undriven if archive.variables[name].type == "Boolean"]
+    if report.still:
+        enable = f", such as {', '.join(switches)}" if switches else ""
+        remarks["plant.actions"] = (
+            f"CHECK: no state and no output moves by {', '.join(report.still)} as things are; an "
+            f"input{enable}, may have to be set by plant.parameters first"
+        )
+    if report.undriven:
+        inputs = ", ".join(f"{name} = {start or '?'}" for name, start in report.undriven.items())
+        remarks["plant.parameters"] = (
+            f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
+        )
+    if report.restart is not Restart.RESET:
+        remarks["plant.fmu"] = f"each episode: {report.restart.value}, since no reset was proven"
+    return document | {"plant": plant | {"mapping": mapping}}, remarks
+
+
+def _outputs_remark(report: Report) -> str:
+    """What is known of the outputs that doStep computes."""
+    ends = [name for name, kind in report.kinds.items() if kind is Kind.END]
+    if not ends:
+        return "doStep computes the outputs: they are read after it"
+    return (
+        f"doStep computes the outputs; CHECK: {', '.join(ends)} belongs to the end of a sample, so "
+        "that figures that need it at its begin are refused"
+    )
 
 
 def _with_starts(
@@ -292,21 +383,23 @@ def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
 
     A remark on a key that the text does not have stands above its table.
     """
-    lines = [HEAD, ""]
+    names = []
     table = ""
-    left = dict(remarks)
     for line in text.splitlines():
         if line.startswith("["):
             table = line.strip("[]")
-            name = table
+            names.append(table)
         else:
             key = line.partition(" =")[0]
-            name = f"{table}.{key}" if table else key
-        if remark := left.pop(name, ""):
-            lines += textwrap.wrap(
-                remark, 98, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False
-            )
-        lines.append(line)
+            names.append(f"{table}.{key}" if table else key)
+    above: dict[str, list[str]] = {}
+    for name, remark in remarks.items():
+        place = name if name in names else name.rpartition(".")[0]
+        wrapped = textwrap.wrap(remark, 98, break_on_hyphens=False)
+        above.setdefault(place, []).extend(f"# {words}" for words in wrapped)
+    lines = [HEAD, ""]
+    for name, line in zip(names, text.splitlines(), strict=True):
+        lines += [*above.pop(name, []), line]
     return "\n".join([*lines, ""])
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from cosim.errors import PlantError
-from cosim.plant.fmi import UnpackedFmu
-from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.wiring import REALS, has_start
+from cosim.plant.fmi import Order, Reading, UnpackedFmu, number
+from cosim.plant.wiring import REALS, Wiring, has_start
 from cosim.scenario import Scenario
 
 WORDS = ("start", "init", "initial", "ini", "initialvalue", "startvalue", "t0", "0")
@@ -37,8 +35,7 @@ def start_parameters(scenario: Scenario, fmu: UnpackedFmu) -> dict[str, str]:
         PlantError: The FMU does not run as this scenario's plant.
     """
     states = scenario.plant.states
-    with FmuPlant(_starting_by(scenario, {})) as plant:
-        initial = dict(zip(states, plant.reset(0).tolist(), strict=True))
+    initial = dict(zip(states, _initial_states(scenario, fmu, {}, ()), strict=True))
     parameters: dict[str, str] = {}
     for state in states:
         for candidate in candidates(fmu, state):
@@ -107,7 +104,9 @@ def _is(name: str, base: str, word: str) -> bool:
     return plain == word + stem and word.isalpha()
 
 
-def _starting_by(scenario: Scenario, parameters: dict[str, str]) -> Scenario:
+def _starting_by(
+    scenario: Scenario, parameters: dict[str, str], values: Sequence[float]
+) -> Scenario:
     """The scenario with these states alone, or with all of them and no start to be set."""
     plant = scenario.plant
     keep = [i for i, name in enumerate(plant.states) if not parameters or name in parameters]
@@ -120,10 +119,33 @@ def _starting_by(scenario: Scenario, parameters: dict[str, str]) -> Scenario:
     }.items():
         for field in fields:
             document[table][field] = [document[table][field][i] for i in keep]
+    if parameters:
+        document["plant"]["initial_state"] = list(values)
     names = [parameters[plant.states[i]] for i in keep] if parameters else []
     document["plant"] |= {"mapping": {"initial_state": names}, "disturbances": []}
     document["disturbance"] = {"law": "none"}
     return Scenario.from_dict(document)
+
+
+def _initial_states(
+    scenario: Scenario, fmu: UnpackedFmu, parameters: dict[str, str], values: Sequence[float]
+) -> list[float]:
+    """States of a new instance whose parameters have these values, after its initialisation."""
+    wiring = Wiring(_starting_by(scenario, parameters, values), fmu)
+    instance = wiring.interface(
+        fmu,
+        (wiring.inputs, wiring.outputs, wiring.states),
+        wiring.starts,
+        scenario.sampling_time,
+        Reading(Order.SET_STEP_GET),
+        wiring.experiment,
+        None,
+    )
+    try:
+        instance.initialise(started=False)
+        return list(instance.states)
+    finally:
+        instance.close([])
 
 
 def _starts_at(
@@ -133,20 +155,18 @@ def _starts_at(
     names = [name for name in scenario.plant.states if name in parameters]
     asked = [values[name] for name in names]
     try:
-        with FmuPlant(_starting_by(scenario, parameters)) as plant:
-            reached = plant.reset(0, asked).tolist()
+        reached = _initial_states(scenario, fmu, parameters, asked)
     except PlantError:
         return False
-    moves = [abs(_move(fmu, name, value)) for name, value in zip(names, asked, strict=True)]
     return all(
-        abs(state - value) <= AGREES * move
-        for state, value, move in zip(reached, asked, moves, strict=True)
+        abs(state - value) <= AGREES * _move(fmu, name, value)
+        for name, state, value in zip(names, reached, asked, strict=True)
     )
 
 
 def _move(fmu: UnpackedFmu, state: str, value: float) -> float:
-    nominal: Any = getattr(fmu.variable(state), "nominal", None)
-    return PROBED * max(abs(value), abs(float(nominal or 0.0)), 1e-3)
+    nominal = number(getattr(fmu.variable(state), "nominal", None), 0.0)
+    return PROBED * max(abs(value), abs(nominal), 1e-3)
 
 
 def _moved(fmu: UnpackedFmu, state: str, parameter: str, initial: float) -> float:

@@ -53,8 +53,8 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
                 f"{name} steps by multiples of {internal:g} s (fixedInternalStepSize), and the "
                 f"communication step of {step:g} s is none"
             )
-    numbers = [v for v in description.modelVariables if v.type not in _NO_NUMBERS]
-    if not any(v.causality == "input" or v.variability == "tunable" for v in numbers):
+    numbers = [v for v in description.modelVariables if v.type not in NO_NUMBERS]
+    if not any(_can_act(variable) for variable in numbers):
         yield (
             f"{name} has no input and no tunable parameter that is a number: there is nothing for "
             "a controller to act on"
@@ -65,7 +65,7 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
 
 _WIDE = ("Int64", "UInt64")
 INTEGERS = ("Integer", "Int32", "UInt32", *_WIDE)
-_NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
+NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
 
 
 def has_start(variable: Any) -> bool:
@@ -193,17 +193,23 @@ class Wiring:
                 what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
         if what:
             raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
-        stated = ["0"] if variable.type in _NO_NUMBERS else str(variable.start or 0).split()
+        stated = ["0"] if variable.type in NO_NUMBERS else str(variable.start or 0).split()
         starts = tuple(number(text, 0.0) for text in stated) * (prod(shape) // len(stated))
         return Place(int(variable.valueReference), str(variable.type), index, starts)
 
 
 def _no_number(variable: Any) -> str:
-    return f"is {_a(variable.type)}, not a number" if variable.type in _NO_NUMBERS else ""
+    return f"is {_a(variable.type)}, not a number" if variable.type in NO_NUMBERS else ""
+
+
+def _can_act(variable: Any) -> bool:
+    """Whether a variable can be written between two steps; a structural parameter cannot."""
+    tunable = variable.variability == "tunable" and variable.causality == "parameter"
+    return tunable or bool(variable.causality == "input")
 
 
 def _not_written(variable: Any) -> str:
-    if variable.causality != "input" and variable.variability != "tunable":
+    if not _can_act(variable):
         return f"is {_a(variable.causality)}, not an input, and is not tunable"
     return _no_number(variable)
 

@@ -1,5 +1,7 @@
 """Errors whose message is meant for the user: `CosimError`, and those of the co-simulation."""
 
+from typing import Any
+
 
 class CosimError(Exception):
     """Base of every error that the four packages raise on bad input or a failed run."""
@@ -15,6 +17,12 @@ class ScenarioError(CosimError):
 
 class PlantError(CosimError):
     """The plant cannot be loaded, or refused a call."""
+
+
+class RunEndedError(PlantError):
+    """The plant failed in mid run; `trajectory` holds the samples before it."""
+
+    trajectory: Any = None
 
 
 class CapabilityError(PlantError):

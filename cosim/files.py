@@ -110,8 +110,10 @@ CACHE_VARIABLE = "COSIM_CACHE"
 _temporary: dict[Path, Path] = {}
 
 
-def cache_folder(kind: str) -> Path:
+def cache_folder(kind: str, *, plain: bool = False) -> Path:
     """The folder for cached files of a `kind`: the user's, made if need be, or a temporary one.
+
+    `plain` asks for a path without blanks and other signs that a URI escapes.
 
     The user's lies under the environment's COSIM_CACHE, else where the platform keeps caches.
     A temporary one, until this process ends, where that cannot be written or others could write it,
@@ -120,7 +122,8 @@ def cache_folder(kind: str) -> Path:
     chosen = os.environ.get(CACHE_VARIABLE)
     root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
     folder = root.absolute() / kind
-    if _is_ours_alone(folder):
+    is_plain = folder.as_uri().endswith(folder.as_posix())
+    if _is_ours_alone(folder) and (is_plain or not plain):
         return folder
     if folder not in _temporary or not _temporary[folder].is_dir():
         _temporary[folder] = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))

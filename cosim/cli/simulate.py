@@ -31,6 +31,9 @@ def simulate(
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
 
+    Where the plant fails in mid run, the files hold the samples before, summary.json says under
+    `ended` why, and the exit code is 2.
+
     Args:
         controller: naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters
             file, or module:factory.
@@ -41,6 +44,7 @@ def simulate(
         from importlib.metadata import version
 
         from controllers import compile_functions
+        from cosim.errors import PlantError, RunEndedError
         from cosim.files import write_atomically
         from cosim.plugins import parameters_hash
         from cosim.simulation import functions_of
@@ -59,7 +63,11 @@ def simulate(
             compile_functions(law, steps)
             if record:  # a plug-in's own use of pandas stays
                 spare_pandas()
-            run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=out_.live)
+            ended = ""
+            try:
+                run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=out_.live)
+            except RunEndedError as error:
+                run, ended = error.trajectory, str(error)
             summary: dict[str, Any] = {
                 "version": version("rti-cosim"),
                 "scenario": loaded.name,
@@ -70,6 +78,7 @@ def simulate(
                 "parameters_hash": parameters_hash(law) or None,
                 "seed": seed,
                 **run.summary(),
+                **({"ended": ended} if ended else {}),
                 "timing": run.timing_summary() | {"functions": functions_of(law)},
             }
         if not record:
@@ -77,7 +86,7 @@ def simulate(
             (folder / "run.rrd").unlink(missing_ok=True)
         run.write_csv(folder / "trajectory.csv")
         run.write_timing_csv(folder / "timing.csv")
-        if 1 < steps <= DRAWN:
+        if 1 < len(run) <= DRAWN:
             run.plot(folder / "trajectory.png")
         else:  # nor may a shorter run's stay
             (folder / "trajectory.png").unlink(missing_ok=True)
@@ -93,7 +102,9 @@ def simulate(
             (f"{name} time, median / 99 %", f"{t['median_us']:.1f} / {t['p99_us']:.1f} µs")
             for name, t in run.timing_summary().items()
         ]
-        title = f"{controller} on {loaded.name}, {steps} samples, seed {seed}"
+        title = f"{controller} on {loaded.name}, {len(run)} samples, seed {seed}"
         out_.table(title, ("per sample", "value"), rows)
         out_.note(f"files are in {out.resolve()}")
         out_.json(summary, folder)
+        if ended:
+            raise PlantError(f"{ended}; they are in {out.resolve()}")

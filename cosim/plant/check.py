@@ -61,7 +61,7 @@ class PlantCheck:
                 "snapshots": report.snapshots,
                 "serialises": report.serialises,
                 "experiment": report.experiment._asdict(),
-                "actions_that_move_nothing": list(report.still),
+                "actions_that_move_no_state": list(report.still),
                 "undriven_inputs": report.undriven,
             }
         return document
@@ -250,5 +250,5 @@ def _verdict(report: Report) -> str:
     if report.restart.name != "RESET":
         words.append(report.restart.value + " for each episode")
     if report.still:
-        words.append(f"but nothing moves by {_some(report.still)} as things are")
+        words.append(f"but no state moves by {_some(tuple(report.still))} as things are")
     return "; ".join(words)

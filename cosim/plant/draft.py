@@ -251,10 +251,12 @@ def _with_what_was_seen(
         remarks["plant.tolerance"] = "relative, of the FMU's solver; the FMU's own"
     switches = [name for name in report.undriven if archive.variables[name].type == "Boolean"]
     if report.still:
-        enable = f", such as {', '.join(switches)}" if switches else ""
+        nothing = [name for name, moves_output in report.still.items() if not moves_output]
+        alone = f", no output either by {', '.join(nothing)}," if nothing else ""
+        enable = f" such as {', '.join(switches)}" if switches else ""
         remarks["plant.actions"] = (
-            f"CHECK: no state and no output moves by {', '.join(report.still)} as things are; an "
-            f"input{enable}, may have to be set by plant.parameters first"
+            f"CHECK: no state moves by {', '.join(report.still)}{alone} as things are; an input"
+            f"{enable} may have to be set by plant.parameters first"
         )
     if report.undriven:
         inputs = ", ".join(f"{name} = {start or '?'}" for name, start in report.undriven.items())

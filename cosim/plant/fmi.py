@@ -256,11 +256,12 @@ def _obstacle(description: Any) -> str:
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
-    Where others can write the user's cache, or the user cannot, it lies in a temporary folder that
-    ends with this process. Raises OSError and what zipfile raises where the archive cannot be
-    unpacked.
+    Where others can write the user's cache, or the user cannot, or its path has a blank or another
+    sign that a URI escapes, it lies in a temporary folder that ends with this process: many FMUs
+    do not read escapes in the URI of their resources. Raises OSError and what zipfile raises where
+    the archive cannot be unpacked.
     """
-    cache = cache_folder("fmus")
+    cache = cache_folder("fmus", plain=True)
     folder = cache / sha256
     if _holds(folder, archive):
         return folder
@@ -419,6 +420,18 @@ NOT_FINITE = 5
 """Fault of a compiled loop: an output or state is not finite; lower numbers: a call of FMI."""
 
 
+def _why_not_loaded(words: str, library: str) -> str:
+    """What keeps a library, which is there, from being loaded; `words` are the system's."""
+    name = Path(library).name
+    missing, _, rest = words.partition(": cannot open shared object file: No such file")
+    if rest and missing != library:
+        return (
+            f"does not load: its '{name}' needs the library '{missing}', which this machine does "
+            "not have; install that"
+        )
+    return f"does not load: its '{name}' is there, but {words}"
+
+
 class Instance(ABC):
     """One co-simulation instance, called through raw function pointers and fixed buffers.
 
@@ -515,9 +528,11 @@ class Instance(ABC):
             except Exception as error:
                 tool = self._interface.needsExecutionTool
                 hint = "; it needs the tool that made it (needsExecutionTool)" if tool else ""
-                raise PlantError(
-                    f"FMU '{self.fmu.path}' cannot be instantiated: {error}{hint}{self._log()}"
-                ) from None
+                what = f"cannot be instantiated: {error}"
+                unloaded = f"Failed to load shared library {library}. "
+                if str(error).startswith(unloaded):
+                    what = _why_not_loaded(str(error).removeprefix(unloaded), library)
+                raise PlantError(f"FMU '{self.fmu.path}' {what}{hint}{self._log()}") from None
             finally:
                 os.chdir(folder)
 
@@ -770,12 +785,21 @@ _numbers = itertools.count()
 _logs: WeakValueDictionary[bytes, deque[str]] = WeakValueDictionary()
 
 
-def _log(_: Any, instance: bytes, status: int, category: bytes, message: bytes) -> None:
-    text = message.decode("utf-8", "replace")
-    if (log := _logs.get(instance)) is not None:
+def _log(
+    _: Any, instance: bytes | None, status: int, category: bytes | None, message: bytes | None
+) -> None:
+    """Keep a message for the error that may follow.
+
+    Some FMUs sign it with another name than the instance's, or with none: then each instance that
+    lives keeps it.
+    """
+    text = (message or b"").decode("utf-8", "replace")
+    known = _logs.get(instance or b"")
+    logs = [known] if known is not None else list(_logs.values())
+    for log in logs:
         log.append(text)
-    elif status > WARNING:
-        print(f"{instance.decode('utf-8', 'replace')}: {text}", file=sys.stderr)
+    if not logs and status > WARNING:
+        print(f"{(instance or b'FMU').decode('utf-8', 'replace')}: {text}", file=sys.stderr)
 
 
 # fmpy's proxy, which formats the variadic message, knows one Python logger per process.

@@ -349,12 +349,15 @@ _alive: Counter[str] = Counter()
 class Place(NamedTuple):
     """Where a number is in an FMU: value reference and FMI type of its variable; of an array, which
     element, row by row, and the values that all its elements start from.
+
+    A `structural` parameter (FMI 3.0) is set in configuration mode.
     """
 
     reference: int
     type: str
     element: int = 0
     starts: tuple[float, ...] = (0.0,)
+    structural: bool = False
 
 
 class Order(IntEnum):
@@ -490,9 +493,15 @@ class Instance(ABC):
         self._do_step = self._function("DoStep")
         self._first, self._second, self._third = self._calls_of_a_step(reading)
         self._to_start = self._calls_to_start()
-        self._start_places = places = [place for place, _ in starts]
+        self._start_places = [place for place, _ in starts]
+        structural = [(place, value) for place, value in starts if place.structural]
+        self._set_structure: Callable[[], None] | None = None
+        if structural:
+            self._set_structure = self.writer(*zip(*structural, strict=True))
+        plain = [(place, value) for place, value in starts if not place.structural]
+        places = [place for place, _ in plain]
         self._starts, self._set_starts = self._exchange(places, "Set")
-        self._starts[:] = [value for _, value in starts]
+        self._starts[:] = [value for _, value in plain]
         # FMI 2 counts value references anew for each type.
         self._start_of = {place[:3]: i for i, place in enumerate(places)}
 
@@ -552,6 +561,10 @@ class Instance(ABC):
         """Reset (if started before), write the start values, initialise and read the states."""
         if started:
             self._call("Reset", self._component)
+        if self._set_structure is not None:
+            self._call("EnterConfigurationMode", self._component)
+            self._set_structure()
+            self._call("ExitConfigurationMode", self._component)
         if self._starts:
             self._set_starts()
         for name, arguments in self._to_start:
@@ -948,5 +961,6 @@ class Fmi3Instance(Instance):
         """Raise PlantError where a step ended early; `least` [s] is a time that it had to pass."""
         last = self._last_time.value
         if self._terminate.value or self._early.value or last < least:
-            self.messages.append(f"the FMU ended the step early, at {last} s")
+            what = "run" if self._terminate.value else "step early"
+            self.messages.append(f"the FMU ended the {what}, at {last} s")
             self.fail("DoStep", DISCARD)

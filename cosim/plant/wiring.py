@@ -183,7 +183,7 @@ class Wiring:
                 f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}, "
                 f"which {asked}"
             )
-        what, shape, index = misfit(variable), tuple(variable.shape or ()), 0
+        what, shape, index = misfit(variable), self._shape(variable), 0
         if shape and not what:
             try:
                 indices = name.removeprefix(variable.name).removeprefix("[").removesuffix("]")
@@ -193,9 +193,42 @@ class Wiring:
                 what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
         if what:
             raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
-        stated = ["0"] if variable.type in NO_NUMBERS else str(variable.start or 0).split()
-        starts = tuple(number(text, 0.0) for text in stated) * (prod(shape) // len(stated))
-        return Place(int(variable.valueReference), str(variable.type), index, starts)
+        structural = variable.causality == "structuralParameter"
+        starts = _start_values(variable, prod(shape))
+        if starts is None:
+            if misfit is not _no_number:  # it is to be set, and the others with it
+                raise PlantError(
+                    f"array '{variable.name}' of FMU '{fmu.path.name}' is {shape} by "
+                    "plant.parameters, and its description states start values of another size: no "
+                    f"element of it can be set; {asked} '{name}'"
+                )
+            starts = (0.0,) * prod(shape)
+        reference = int(variable.valueReference)
+        return Place(reference, str(variable.type), index, starts, structural)
+
+    def _shape(self, variable: Any) -> tuple[int, ...]:
+        """Shape of a variable, by the structural parameters as the scenario sets them."""
+        parameters = self._scenario.plant.parameters
+        shape = []
+        for dimension in variable.dimensions:
+            size = dimension.start
+            if size is None:
+                by = dimension.variable
+                size = parameters.get(by.name, number(by.start, 0.0))
+            shape.append(int(size))
+        return tuple(shape)
+
+
+def _start_values(variable: Any, size: int) -> tuple[float, ...] | None:
+    """Start values of a variable of so many elements; None where it states another number."""
+    stated = ["0"] if variable.type in NO_NUMBERS else str(variable.start or 0).split()
+    if size == 1:  # its name gives all of it
+        stated = stated[:1]
+    elif len(stated) == 1:
+        stated *= size
+    if len(stated) != size:
+        return None
+    return tuple(number(text, 0.0) for text in stated)
 
 
 def _no_number(variable: Any) -> str:

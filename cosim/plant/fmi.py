@@ -717,7 +717,7 @@ class Instance(ABC):
         """Raise PlantError for the fault of a compiled loop."""
         names = (f"Set{self.real}", f"Get{self.real}", "DoStep", "DoStep")
         if fault == len(names):
-            self.messages.append("the FMU ended the step early")
+            self.messages.append("the FMU ended the run, or the step early")
             status = DISCARD
         self.fail(names[fault - 1], status)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from math import ceil, prod
+from math import ceil, isnan, nan, prod
 from typing import Any
 
 import numpy as np
@@ -113,7 +113,6 @@ class Wiring:
         self._scenario, self._fmu, plant = scenario, fmu, scenario.plant
         self.interface = interface(fmu)
         self.experiment = experiment(fmu, plant)
-        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
         self.outputs = self._numbers((plant.stage_cost, *plant.disturbances), "plant")
         self.states = self._numbers(plant.states, "plant.states")
         self.initial = self._numbers(plant.mapping.initial_state, "plant.mapping.initial_state")
@@ -123,6 +122,9 @@ class Wiring:
                 self.seeds.append(self._place(name, "plant.mapping.seed", _no_word))
         self.start_names: list[str] = []
         self.starts = self._starts()
+        self._require_whole_arrays([place for place, _ in self.starts])
+        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
+        self._require_whole_arrays(self.inputs)
 
     def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
         """By the number of a sample the places to write at its start, and the values."""
@@ -133,6 +135,8 @@ class Wiring:
             for name, value in change.parameters.items():
                 places.append(self._place(name, "plant.changes", _not_written))
                 values.append(value)
+        for places, _ in found.values():
+            self._require_whole_arrays(places)
         return found
 
     def _numbers(self, names: Sequence[str], table: str) -> list[Place]:
@@ -194,17 +198,26 @@ class Wiring:
         if what:
             raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
         structural = variable.causality == "structuralParameter"
-        starts = _start_values(variable, prod(shape))
-        if starts is None:
-            if misfit is not _no_number:  # it is to be set, and the others with it
-                raise PlantError(
-                    f"array '{variable.name}' of FMU '{fmu.path.name}' is {shape} by "
-                    "plant.parameters, and its description states start values of another size: no "
-                    f"element of it can be set; {asked} '{name}'"
-                )
-            starts = (0.0,) * prod(shape)
+        starts = _start_values(variable, prod(shape)) or (nan,) * prod(shape)
         reference = int(variable.valueReference)
         return Place(reference, str(variable.type), index, starts, structural)
+
+    def _require_whole_arrays(self, places: Sequence[Place]) -> None:
+        """Raise PlantError where an array whose start values are not known is set in part."""
+        unknown = [place for place in places if any(map(isnan, place.starts))]
+        for place in unknown:
+            named = {other.element for other in unknown if other[:2] == place[:2]}
+            if len(named) < len(place.starts):
+                name = next(
+                    variable.name
+                    for variable in self._fmu.variables.values()
+                    if (variable.valueReference, variable.type) == place[:2]
+                )
+                raise PlantError(
+                    f"array '{name}' of FMU '{self._fmu.path.name}' has {len(place.starts)} "
+                    "elements by plant.parameters, for which its description states no start "
+                    f"values: scenario '{self._scenario.name}' must name each where it names one"
+                )
 
     def _shape(self, variable: Any) -> tuple[int, ...]:
         """Shape of a variable, by the structural parameters as the scenario sets them."""
@@ -220,7 +233,10 @@ class Wiring:
 
 
 def _start_values(variable: Any, size: int) -> tuple[float, ...] | None:
-    """Start values of a variable of so many elements; None where it states another number."""
+    """Start values of a variable of so many elements; None where it states another number of them.
+
+    That is so where a structural parameter gives an array another size.
+    """
     stated = ["0"] if variable.type in NO_NUMBERS else str(variable.start or 0).split()
     if size == 1:  # its name gives all of it
         stated = stated[:1]

@@ -71,9 +71,17 @@ def information(fmu: Path, description: ModelDescription | None = None) -> dict[
         "interfaces": list(flags),
         "platforms": platforms,
         "flags": flags,
-        **{key: None if value is None else float(value) for key, value in stated.items()},
+        **{key: _number(value) for key, value in stated.items()},
         "variables": [{n: getattr(v, n) for n in _VARIABLE} for v in about.modelVariables],
     }
+
+
+def _number(stated: str | None) -> float | None:
+    """A number of the description; None where it states none, or a text that is no number."""
+    try:
+        return None if stated is None else float(stated)
+    except ValueError:
+        return None
 
 
 class NotOfferedError(FmuError):
@@ -99,6 +107,6 @@ def declared_variables(fmu: Path) -> str:
         raise NotOfferedError("the FMU has neither co-simulation nor model exchange")
     names = [variable.name for variable in description.modelVariables]
     stated = getattr(description.defaultExperiment, "stepSize", None)
-    step = float(stated or 1.0)
+    step = _number(stated) or 1.0
     fmpy.simulate_fmu(str(fmu), output=names, start_time=0.0, stop_time=step, output_interval=step)
     return f"{len(names)} read"

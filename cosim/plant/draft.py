@@ -33,6 +33,8 @@ HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
 COSTS = ("cost", "loss", "objective")
+SHOWN = 12
+"""Inputs that a remark names at most."""
 
 
 @dataclass(frozen=True)
@@ -259,7 +261,9 @@ def _with_what_was_seen(
             f"{enable} may have to be set by plant.parameters first"
         )
     if report.undriven:
-        inputs = ", ".join(f"{name} = {start or '?'}" for name, start in report.undriven.items())
+        pairs = [f"{name} = {start or '?'}" for name, start in report.undriven.items()]
+        more = f" and {len(pairs) - SHOWN} more" if len(pairs) > SHOWN else ""
+        inputs = ", ".join(pairs[:SHOWN]) + more
         remarks["plant.parameters"] = (
             f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
         )

@@ -256,9 +256,8 @@ def _obstacle(description: Any) -> str:
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
-    Where others can write the user's cache, or the user cannot, or its path has a blank or another
-    sign that a URI escapes, it lies in a temporary folder that ends with this process: many FMUs
-    do not read escapes in the URI of their resources. Raises OSError and what zipfile raises where
+    It lies in a `cosim.files.cache_folder`, whose path has no escapes in its URI, since many FMUs
+    do not read those in the URI of their resources. Raises OSError and what zipfile raises where
     the archive cannot be unpacked.
     """
     cache = cache_folder("fmus", plain=True)

@@ -10,12 +10,14 @@ import os
 import shutil
 import stat
 import sys
+import tempfile
 import threading
 import warnings
 import zipfile
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -422,9 +424,20 @@ NOT_FINITE = 5
 """Fault of a compiled loop: an output or state is not finite; lower numbers: a call of FMI."""
 
 
-def _why_not_loaded(words: str, library: str) -> str:
+@contextmanager
+def _copy_of(library: Path) -> Iterator[Path]:
+    """A copy of a library beside it, which is loaded as another one; deleted after the block."""
+    handle, name = tempfile.mkstemp(library.suffix, f".{library.stem}-", library.parent)
+    os.close(handle)
+    try:
+        yield Path(shutil.copyfile(library, name))
+    finally:
+        with suppress(OSError):  # Windows keeps a file that is loaded
+            Path(name).unlink()
+
+
+def _why_not_loaded(words: str, library: str, name: str) -> str:
     """What keeps a library, which is there, from being loaded; `words` are the system's."""
-    name = Path(library).name
     missing, _, rest = words.partition(": cannot open shared object file: No such file")
     if rest and missing != library:
         return (
@@ -523,6 +536,13 @@ class Instance(ABC):
 
     def _load(self) -> Any:
         library = str(library_path(self.fmu).resolve())
+        if self._interface.canBeInstantiatedOnlyOncePerProcess:
+            # Its memory is static and keeps what an earlier instance left: a copy has its own.
+            with _copy_of(Path(library)) as copy:
+                return self._load_library(str(copy))
+        return self._load_library(library)
+
+    def _load_library(self, library: str) -> Any:
         with _construction_lock:
             folder = Path.cwd()
             try:
@@ -539,7 +559,8 @@ class Instance(ABC):
                 what = f"cannot be instantiated: {error}"
                 unloaded = f"Failed to load shared library {library}. "
                 if str(error).startswith(unloaded):
-                    what = _why_not_loaded(str(error).removeprefix(unloaded), library)
+                    words = str(error).removeprefix(unloaded)
+                    what = _why_not_loaded(words, library, library_path(self.fmu).name)
                 raise PlantError(f"FMU '{self.fmu.path}' {what}{hint}{self._log()}") from None
             finally:
                 os.chdir(folder)

@@ -13,7 +13,7 @@ from cosim.errors import CosimError, PlantError
 from cosim.plant.draft import first_document, guess_roles, number_roles
 from cosim.plant.fmi import DESCRIPTION, SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.probe import Report, Row, probe
+from cosim.plant.probe import AFTER, Report, Row, probe
 from cosim.plant.starts import start_parameters
 from cosim.plant.wiring import REALS, refusals
 from cosim.scenario import Scenario
@@ -245,7 +245,7 @@ def _run(scenario: Scenario) -> Row:
 
 def _verdict(report: Report) -> str:
     words = ["it can be a plant"]
-    if report.outputs == "after-step":
+    if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
         words.append('its outputs are read after the step (plant.outputs = "after-step")')
     if report.restart.name != "RESET":
         words.append(report.restart.value + " for each episode")

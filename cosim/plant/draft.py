@@ -19,7 +19,7 @@ from cosim.errors import PlantError
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
 from cosim.plant.probe import AFTER, Kind, Report, Restart, probe
-from cosim.plant.starts import start_parameters
+from cosim.plant.starts import candidates, start_parameters
 from cosim.plant.wiring import INTEGERS, NO_NUMBERS, REALS, refusals
 from cosim.protocols import Array
 from cosim.scenario import Scenario
@@ -92,9 +92,10 @@ def number_roles(
 
     Args:
         fmu: An FMU that is not refused.
-        states: States, if known; else all numbers among the outputs, else among the locals.
+        states: States, if known; else all other numbers among the outputs, else the locals.
         actions: Actions, if known; else all numbers among the inputs, else a tunable parameter.
-        stage_cost: Stage cost, if known; else the first of these states.
+        stage_cost: Stage cost, if known; else the first output that is called a cost, else the
+            first output.
     """
 
     def names(causality: str, variability: str = "") -> tuple[str, ...]:
@@ -106,12 +107,15 @@ def number_roles(
             and variable.type not in NO_NUMBERS
         )
 
-    tried_states = tuple(states) or names("output") or names("local")
+    outputs = names("output") or names("local")
+    costs = [name for name in outputs if _is_cost(name)]
+    cost = stage_cost or (costs[0] if costs else outputs[0])
+    others = tuple(name for name in outputs if name != cost)
     return Roles(
-        states=tried_states,
+        states=tuple(states) or others or outputs,
         actions=tuple(actions) or names("input") or names("parameter", "tunable")[:1],
         disturbances=(),
-        stage_cost=stage_cost or tried_states[0],
+        stage_cost=cost,
     )
 
 
@@ -421,7 +425,7 @@ def _cost(fmu: UnpackedFmu) -> str:
     outputs = _reals(fmu, "output")
     if not outputs:
         raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output to draft from")
-    costs = [name for name in outputs if any(word in name.lower() for word in COSTS)]
+    costs = [name for name in outputs if _is_cost(name)]
     if len(costs) == 1:
         return costs[0]
     which = f"{' and '.join(costs)} could be" if costs else "none is called a cost"
@@ -431,6 +435,10 @@ def _cost(fmu: UnpackedFmu) -> str:
     )
 
 
+def _is_cost(name: str) -> bool:
+    return any(word in name.lower() for word in COSTS)
+
+
 def _states(fmu: UnpackedFmu, others: Sequence[str]) -> list[str]:
     """Continuous states, else outputs with a start parameter."""
     rates = [v for v in fmu.variables.values() if getattr(v, "derivative", None) is not None]
@@ -438,11 +446,11 @@ def _states(fmu: UnpackedFmu, others: Sequence[str]) -> list[str]:
         names = [name for rate in rates for name in elements(rate.derivative)]
         return list(dict.fromkeys(names))
     outputs = [name for name in _reals(fmu, "output") if name not in others]
-    if started := [name for name in outputs if f"{name}_start" in fmu.variables]:
+    if started := [name for name in outputs if any(candidates(fmu, name))]:
         return started
     raise PlantError(
-        f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no parameters "
-        f"NAME_start); give --states A,B,…, of {', '.join(_reals(fmu, 'output'))}"
+        f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no start "
+        f"parameters); give --states A,B,…, of {', '.join(_reals(fmu, 'output'))}"
     )
 
 

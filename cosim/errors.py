@@ -1,5 +1,7 @@
 """Errors whose message is meant for the user: `CosimError`, and those of the co-simulation."""
 
+from typing import Any
+
 
 class CosimError(Exception):
     """Base of every error that the four packages raise on bad input or a failed run.
@@ -27,8 +29,18 @@ class PlantError(CosimError):
     """The plant cannot be loaded, or refused a call."""
 
 
+class RunEndedError(PlantError):
+    """The plant failed in mid run; `trajectory` holds the samples before it."""
+
+    trajectory: Any = None
+
+
 class CapabilityError(PlantError):
     """A capability was asked for that this FMU does not have, e.g. saving its state."""
+
+
+class FmuWarning(CosimWarning):
+    """An FMU is used although its model description has flaws."""
 
 
 class ControllerLookupError(CosimError):

@@ -216,6 +216,9 @@ def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int]) -> No
         raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
 
 
+NO_NOISE = "no noise: all seeds are the same run, and an interval of width 0 says nothing"
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(Result):
     """Indicators of controllers × seeds on common random numbers.
@@ -260,6 +263,12 @@ class Evaluation(Result):
             if word not in known:
                 raise EvaluationError(f"there is no '{word}'{instead(word, map(str, known))}")
         return np.asarray(self.columns[controller][name])
+
+    @property
+    def without_noise(self) -> bool:
+        """Whether all seeds, of which there are several, gave each controller the same run."""
+        costs = [self.column(name, "J") for name in self.controllers]
+        return len(self.seeds) > 1 and all((cost == cost[0]).all() for cost in costs)
 
     def _cost(self, controller: str) -> Array:
         """J over the seeds, (S,), NaN of a controller that was not evaluated."""
@@ -330,6 +339,7 @@ class Evaluation(Result):
         return {
             **self.facts,
             "seeds": list(self.seeds),
+            **({"remark": NO_NOISE} if self.without_noise else {}),
             "reference": self.reference,
             "optimum": self.optimum,
             "optimal_J": None if self.optimum is None else float(np.mean(self.optimal)),

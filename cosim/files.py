@@ -197,22 +197,32 @@ CACHE_VARIABLE = "COSIM_CACHE"
 _temporary: dict[Path, Path] = {}
 
 
-def cache_folder(kind: str) -> Path:
+def cache_folder(kind: str, *, plain: bool = False) -> Path:
     """The folder for cached files of a `kind`: the user's, made if need be, or a temporary one.
 
     The user's lies under the environment's COSIM_CACHE, else where the platform keeps caches.
     A temporary one, until this process ends, where that cannot be written or others could write it,
     since native code is loaded from here.
+
+    `plain` asks for a path without blanks and other signs that a URI escapes: where the user's has
+    some, a folder of the user alone in the system's folder of temporary files takes its place.
     """
     chosen = os.environ.get(CACHE_VARIABLE)
     root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
+    user = getattr(os, "getuid", int)()  # Windows has a folder of temporary files for each user
     folder = root.absolute() / kind
+    if plain and not _is_plain(folder):
+        folder = Path(tempfile.gettempdir()) / f"rti-cosim-{user}" / kind
     if _is_ours_alone(folder):
         return folder
     if folder not in _temporary or not _temporary[folder].is_dir():
         _temporary[folder] = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))
         atexit.register(shutil.rmtree, _temporary[folder], ignore_errors=True)
     return _temporary[folder]
+
+
+def _is_plain(folder: Path) -> bool:
+    return folder.as_uri().endswith(folder.as_posix())
 
 
 def _is_ours_alone(folder: Path) -> bool:

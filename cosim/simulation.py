@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.errors import CosimError
+from cosim.errors import CosimError, PlantError, RunEndedError
 from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
 from cosim.scenario import Scenario
 from cosim.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
@@ -58,7 +58,8 @@ def simulate(
 
     A failed solve is an exception whose class has `is_solver_failure`. The last applied action
     (first the scenario's reference action) is then applied again, the failure is counted, and the
-    controller is reset. Every other error is raised.
+    controller is reset. Every other error is raised; where the plant fails in mid run it is a
+    RunEndedError, whose `trajectory` has the samples before.
     """
     steps = whole_number("steps", steps, 1, CosimError)
     run = _Run(plant, controller, steps, seed, residuals)
@@ -70,14 +71,21 @@ def simulate(
     if drives and hasattr(type(controller), "compiled_loop"):
         # The classes' own methods, not a wrapper's.
         loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
-    with reporting(progress, plant.scenario.name, steps) as tell:
-        if loop is not None:
-            run.compiled(loop, tell)
-        elif recorder is None:
-            run.interpreted(None, tell)
-        else:
-            with closing(recorder):
-                run.interpreted(recorder.record, tell)
+    try:
+        with reporting(progress, plant.scenario.name, steps) as tell:
+            if loop is not None:
+                run.compiled(loop, tell)
+            elif recorder is None:
+                run.interpreted(None, tell)
+            else:
+                with closing(recorder):
+                    run.interpreted(recorder.record, tell)
+    except PlantError as error:
+        if run.done == 0:
+            raise
+        ended = RunEndedError(f"{error}; the run ended after {run.done} of {steps} samples")
+        ended.trajectory = run.trajectory()
+        raise ended from error
     return run.trajectory()
 
 
@@ -106,63 +114,92 @@ class _Run:
         self._status: list[str] = []
         self._predicted: dict[str, Array] = {}
         self._final_state: Array | None = None
+        self.done = 0
+        """Number of samples that are stored."""
 
     def interpreted(
         self, record: Callable[..., None] | None, progress: Callable[[int], None]
     ) -> None:
-        shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
-        plant, solve, rows = self._plant, self._solve, list[list[float]]()
+        plant, rows = self._plant, list[list[float]]()
         s = plant.reset(spawn_seeds(self._seed)[0])
         self._controller.reset()
         applied = self._scenario.reference_action
-        for k in range(self._steps):
-            s.flags.writeable = False  # for the controller
-            solution, prepare_time, feedback_time = solve(s)
-            action = applied if solution is None else solution.action
-            numbers = isinstance(action, np.ndarray) and action.dtype.kind in "fiu"
-            if not numbers or action.shape != shape:
-                given = f"shape {action.shape}" if numbers else f"{type(action).__name__} {action}"
-                raise self._wrong(f"an action of {given}, not {shape}", k)
-            applied = saturate(action)
-            begin = perf_counter()
-            step = plant.step(applied)
-            plant_time = perf_counter() - begin
-            value = residual = nan
-            if solution is not None:
-                value = self._number(solution, "value", k)
-                if self._residuals:
-                    residual = self._number(solution, "residual", k)
-            row = [*s.tolist(), *applied.tolist(), step.stage_cost, *step.disturbance.tolist()]
-            row += [value, residual, solution is None, prepare_time, feedback_time, plant_time]
-            rows.append(row)
-            s = step.s
-            if record is not None and solution is not None:
-                self._keep_prediction(k, solution)
-            if (k + 1) % self._length == 0 or k + 1 == self._steps:
-                first = k // self._length * self._length
-                columns = self._fill(first, np.array(rows))
-                rows.clear()
-                if record is not None:
-                    predicted = {name: a[: k + 1 - first] for name, a in self._predicted.items()}
-                    record(first, columns | predicted, self._status[first:])
-                    self._predicted = {}
-                progress(k + 1)
-        self._final_state = s
+        try:
+            for k in range(self._steps):
+                s.flags.writeable = False  # for the controller
+                solution, prepare_time, feedback_time = self._solve(s)
+                applied = self._applied(applied if solution is None else solution.action, k)
+                begin = perf_counter()
+                step = plant.step(applied)
+                plant_time = perf_counter() - begin
+                value = residual = nan
+                if solution is not None:
+                    value = self._number(solution, "value", k)
+                    if self._residuals:
+                        residual = self._number(solution, "residual", k)
+                row = [*s.tolist(), *applied.tolist(), step.stage_cost, *step.disturbance.tolist()]
+                row += [value, residual, solution is None, prepare_time, feedback_time, plant_time]
+                rows.append(row)
+                s = step.s
+                if record is not None and solution is not None:
+                    self._keep_prediction(k, solution)
+                if (k + 1) % self._length == 0 or k + 1 == self._steps:
+                    self._store(rows, record)
+                    progress(k + 1)
+        except PlantError:
+            self._store(rows, record)  # the samples before
+            raise
+        finally:
+            self._final_state = s
+
+    def _applied(self, action: object, k: int) -> Array:
+        """The action within the actuators' bounds; raises CosimError where it is none."""
+        shape = self._scenario.action_lower.shape
+        if isinstance(action, np.ndarray) and action.dtype.kind in "fiu":
+            if action.shape == shape:
+                return self._scenario.saturate(action)
+            given = f"shape {action.shape}"
+        else:
+            given = f"{type(action).__name__} {action}"
+        raise self._wrong(f"an action of {given}, not {shape}", k)
+
+    def _store(self, rows: list[list[float]], record: Callable[..., None] | None) -> None:
+        """Store the rows that are not stored yet, hand them to the recorder, and forget them."""
+        if not rows:
+            return
+        first, count = self.done, len(rows)
+        columns = self._fill(first, np.array(rows))
+        rows.clear()
+        if record is not None:
+            predicted = {name: values[:count] for name, values in self._predicted.items()}
+            record(first, columns | predicted, self._status[first : first + count])
+            self._predicted = {}
 
     def compiled(self, loop: CompiledLoop, progress: Callable[[int], None]) -> None:
         """Run with the controller's loop, to the same columns."""
         self._plant.reset(spawn_seeds(self._seed)[0])
         for first in range(0, self._steps, PART):
             end = min(first + PART, self._steps)
-            table = np.empty((end - first, self._ends[-1]))
-            self._final_state = self._plant.drive(loop, table)  # type: ignore[attr-defined]
-            failed = self._fill(first, table)["failed"]
-            self._status += [FALLBACK if each else "solved" for each in failed]
+            table = np.full((end - first, self._ends[-1]), nan)
+            try:
+                self._final_state = self._plant.drive(loop, table)  # type: ignore[attr-defined]
+            except PlantError:
+                # The plant's time, a row's last number, is written after its step.
+                count = int(np.isfinite(table[:, -1]).sum())
+                self._final_state = table[count, : self._ends[0]].copy()
+                self._keep(first, table[:count])
+                raise
+            self._keep(first, table)
             progress(end)
+
+    def _keep(self, first: int, table: Array) -> None:
+        """Store rows of the compiled loop with their status."""
+        failed = self._fill(first, table)["failed"]
+        self._status += [FALLBACK if sample_failed else "solved" for sample_failed in failed]
 
     def _fill(self, first: int, table: Array) -> dict[str, Array]:
         """Store rows of the signals that are `MEASURED`, and those that follow; all by name."""
-        end = first + len(table)
+        self.done = end = first + len(table)
         stored = {name: column[first:end] for name, column in self._columns.items()}
         stored["time"][:] = np.arange(first, end) * self._scenario.sampling_time
         parts = np.split(table, self._ends[:-1], axis=1)
@@ -226,7 +263,7 @@ class _Run:
         scenario = self._scenario
         named, timing = {}, {}
         for kind in SIGNALS:
-            values = self._columns[kind.name].reshape(self._steps, -1)
+            values = self._columns[kind.name].reshape(self._steps, -1)[: self.done]
             if kind.clock:
                 timing[kind.name.removesuffix("_time")] = values[:, 0]
                 continue
@@ -236,7 +273,7 @@ class _Run:
         return Trajectory(
             scenario=scenario,
             signals=named,
-            status=self._status,
+            status=self._status[: self.done],
             timing=timing,
             final_state=self._final_state,
             seed=self._seed,

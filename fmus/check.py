@@ -1,17 +1,14 @@
-"""The description of an FMU, and its check: fmpy's validation, its variables, a run."""
+"""The description of an FMU: what it states, and fmpy's validation of it."""
 
 from __future__ import annotations
 
 import hashlib
 import re
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import fmpy
-import numpy as np
 from fmpy.model_description import ModelDescription
 from fmpy.validation import validate_fmu
 from lxml import etree
@@ -74,52 +71,33 @@ def information(fmu: Path, description: ModelDescription | None = None) -> dict[
         "interfaces": list(flags),
         "platforms": platforms,
         "flags": flags,
-        **{key: None if value is None else float(value) for key, value in stated.items()},
+        **{key: _number(value) for key, value in stated.items()},
         "variables": [{n: getattr(v, n) for n in _VARIABLE} for v in about.modelVariables],
     }
+
+
+def _number(stated: str | None) -> float | None:
+    """A number of the description; None where it states none, or a text that is no number."""
+    try:
+        return None if stated is None else float(stated)
+    except ValueError:
+        return None
 
 
 class NotOfferedError(FmuError):
     """The FMU or the importer lacks the interface that the check needs."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Result of a check: `status` is "passed", "failed" or "not offered"."""
-
-    subject: str
-    status: str
-    detail: str
-
-
-def check(fmu: Path) -> list[Finding]:
-    """Check the file `fmu`, whose native code this runs.
-
-    Raises FmuError when the file is missing or is no FMU.
-    """
-    description_of(fmu)
-    checks: dict[str, Callable[[Path], str]] = {
-        "model description": validate,
-        "declared variables": declared_variables,
-        "co-simulation": co_simulation,
-    }
-    findings = []
-    for subject, run in checks.items():
-        try:
-            status, detail = "passed", run(fmu)
-        except NotOfferedError as error:
-            status, detail = "not offered", str(error)
-        except Exception as error:  # fmpy raises bare Exception
-            status, detail = "failed", str(error)
-        findings.append(Finding(subject, status, detail))
-    return findings
-
-
 def validate(fmu: Path) -> str:
-    """Schema, names, model structure, start values and units of the model description."""
-    if problems := validate_fmu(str(fmu)):
+    """Schema, names, model structure, start values and units; raises CheckError on a problem."""
+    if problems := problems_of(fmu):
         raise CheckError("; ".join(problems))
     return "no problem found"
+
+
+def problems_of(fmu: Path) -> list[str]:
+    """What an FMU, a file or an unpacked folder, has against FMI's rules of its description."""
+    return [" ".join(str(problem).split()) for problem in validate_fmu(str(fmu))]
 
 
 def declared_variables(fmu: Path) -> str:
@@ -129,17 +107,6 @@ def declared_variables(fmu: Path) -> str:
         raise NotOfferedError("the FMU has neither co-simulation nor model exchange")
     names = [variable.name for variable in description.modelVariables]
     stated = getattr(description.defaultExperiment, "stepSize", None)
-    step = float(stated or 1.0)
+    step = _number(stated) or 1.0
     fmpy.simulate_fmu(str(fmu), output=names, start_time=0.0, stop_time=step, output_interval=step)
     return f"{len(names)} read"
-
-
-def co_simulation(fmu: Path) -> str:
-    """The default experiment runs by `simulate_fmu`, every output is finite."""
-    if description_of(fmu).coSimulation is None:
-        raise NotOfferedError("the FMU has no co-simulation interface")
-    result = fmpy.simulate_fmu(str(fmu), fmi_type="CoSimulation")
-    names = result.dtype.names[1:]
-    if bad := [name for name in names if not np.isfinite(result[name]).all()]:
-        raise CheckError(f"not finite: {', '.join(bad)}")
-    return f"{len(result)} points of {len(names)} outputs, all finite"

@@ -120,6 +120,8 @@ def show(summary: dict[str, Any], output: cli.Output) -> None:
     rows = list(zip(*(columns[name] for name in header), strict=True))
     title = f"{summary['scenario']}, {summary['steps']} samples"
     output.table(f"{title} × {len(summary['seeds'])} seeds", header, rows)
+    if "remark" in summary:
+        output.note(summary["remark"])
     if summary["optimum"] is not None:
         output.note(
             "regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 import cosim
-from cosim.cli.output import JsonOption, ScenarioOption, output
+from cosim.cli.output import JsonOption, ScenarioOption, output, split_names
 
 
 def export(
@@ -55,7 +55,7 @@ def export(
             if format_ == "fmu":  # before the minutes that compilers may take
                 check_target(target)
         loaded = cosim.Scenario.load(scenario)
-        names = tuple(dict.fromkeys(filter(None, measured.split(","))))
+        names = tuple(dict.fromkeys(split_names(measured)))
         if ssp is not None and (missing := set(names) - set(loaded.plant.disturbances)):
             raise CosimError(f"--ssp: the plant has no disturbance {', '.join(sorted(missing))}")
         rti = controller_fmu.rti_controller(controller, loaded, names)

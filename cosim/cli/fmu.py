@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from cosim.cli.output import JsonOption, output, writable_folder
+from cosim.cli.output import JsonOption, output, split_names, writable_folder
 
 SHOWN = 1000
 """Variables of a table at most: a table of 200 000 takes minutes to print."""
@@ -62,22 +63,60 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
 
 
 @app.command()
-def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
-    """Validate an FMU's model description, read all its variables, run its experiment.
+def check(
+    file: FileArgument = "evaporator",
+    states: str = "",
+    actions: str = "",
+    cost: str | None = None,
+    sampling_time: Annotated[float | None, typer.Option(min=1e-9, max=1e12)] = None,
+    json: JsonOption = False,
+) -> None:
+    """Find out whether an FMU can be a plant, and how, by trying it.
 
-    Exit code 1 if the FMU is wrong.
+    The table says what was looked at, what was seen and what follows; the last line is the
+    verdict. Exit code 0: it can be a plant; 1: it cannot; 2: there is no such FMU. This runs the
+    FMU's native code.
+
+    Args:
+        states: Names, comma-separated; without them as `scenario init` guesses.
+        actions: Names, comma-separated.
+        cost: Output that is the stage cost.
+        sampling_time: Sampling time in s.
     """
     with output(json) as out_:
-        from dataclasses import astuple
+        from cosim.errors import FmuWarning, PlantError
+        from cosim.plant.check import PlantCheck, check_plant
+        from cosim.plant.fmi import SHIPPED
+        from cosim.processes import watch
 
-        from fmus.check import check as run_checks
-
-        out_.announce(file)
-        findings = run_checks(_path(file))
-        out_.table(str(_path(file)), ("check", "result", "detail"), list(map(astuple, findings)))
-        passed = all(f.status != "failed" for f in findings)
-        out_.json({"passed": passed, "checks": [vars(f) for f in findings]})
-    if not passed:
+        path = Path(file).absolute()
+        try:
+            if file not in SHIPPED:
+                watch(f"FMU '{path}', or other native code,")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", FmuWarning)  # the table says the same
+                found = check_plant(
+                    file,
+                    states=split_names(states),
+                    actions=split_names(actions),
+                    stage_cost=cost,
+                    sampling_time=sampling_time,
+                )
+        except PlantError as error:
+            if not path.is_file():
+                raise
+            found = PlantCheck(path, False, f"it cannot be a plant: {error}", ())
+        header = ("checked", "found", "what follows")
+        rows = [(row.subject, row.found, row.consequence) for row in found.rows]
+        if rows:
+            out_.table(str(found.fmu), header, rows)
+        if found.remarks:
+            remarks = [(remark,) for remark in found.remarks[:SHOWN]]
+            out_.table("remarks on the model description", ("remark",), remarks)
+        if not json:
+            print(found.verdict)
+        out_.json(found.to_dict())
+    if not found.usable:
         raise typer.Exit(1)
 
 

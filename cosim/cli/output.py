@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -109,8 +110,9 @@ class Output:
         from cosim.plant.fmi import SHIPPED, unpack
 
         if fmu not in SHIPPED:
+            # The child that is watched unpacks it, so that a warning about it comes once.
+            watch(f"FMU '{Path(fmu).resolve()}', or other native code,")
             found = unpack(fmu)
-            watch(f"FMU '{found.path}', or other native code,")
             self.note(f"native code of {found.path}, sha256 {found.sha256}")
 
 
@@ -201,6 +203,12 @@ def open_folder(folder: Path) -> Path:
     """
     hold(writable_folder(folder))
     return folder.absolute()
+
+
+def split_names(text: str) -> list[str]:
+    """Words of a comma-separated option; a comma in brackets or quotes is a name's: `A[1,2]`."""
+    words = re.findall(r"(?:'[^']*'|\[[^\]]*\]|\([^)]*\)|[^,])+", text)
+    return [word.strip() for word in words if word.strip()]
 
 
 def writable_folder(folder: Path) -> Path:

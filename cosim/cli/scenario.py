@@ -116,8 +116,8 @@ def init(
         text = draft_scenario(
             fmu,
             target,
-            states=_words(states),
-            actions=_words(actions),
+            states=cli.split_names(states),
+            actions=cli.split_names(actions),
             stage_cost=cost,
             sampling_time=sampling_time,
             state=_numbers(state, "--state"),
@@ -133,12 +133,8 @@ def init(
         out_.json({"file": str(target), **drafted.to_dict(), "hash": drafted.hash})
 
 
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
 def _numbers(text: str, option: str) -> list[float]:
     try:
-        return [float(word) for word in _words(text)]
+        return [float(word) for word in cli.split_names(text)]
     except ValueError:
         raise CosimError(f"{option} takes numbers, comma-separated, not '{text}'") from None

@@ -35,6 +35,9 @@ def simulate(
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
 
+    Where the plant fails in mid run, the files hold the samples before, summary.json says under
+    `ended` why, and the exit code is 2.
+
     Args:
         controller: naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters
             file, or module:factory.
@@ -42,6 +45,7 @@ def simulate(
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with cli.output(json) as out_:
+        from cosim.errors import PlantError
         from cosim.files import staged
 
         loaded = cosim.Scenario.load(scenario)
@@ -62,10 +66,12 @@ def simulate(
             for name, t in summary["timing"].items()
             if name != "functions"
         ]
-        title = f"{controller} on {loaded.name}, {steps} samples, seed {seed}"
+        title = f"{controller} on {loaded.name}, {summary['samples']} samples, seed {seed}"
         out_.table(title, ("per sample", "value"), rows)
         out_.note(f"files are in {out.resolve()}")
         out_.json(summary)
+        if ended := summary.get("ended"):
+            raise PlantError(f"{ended}; they are in {out.resolve()}")
 
 
 def _run(
@@ -77,10 +83,15 @@ def _run(
     record: bool,
     progress: bool,
 ) -> dict[str, Any]:
-    """Simulate, and write all files but summary.json to an empty folder; the summary."""
+    """Simulate, and write all files but summary.json to an empty folder.
+
+    Returns:
+        The summary; `ended` in it says why a run stopped before its last sample.
+    """
     from importlib.metadata import version
 
     from controllers import compile_functions
+    from cosim.errors import RunEndedError
     from cosim.plugins import parameters_hash
     from cosim.simulation import functions_of
 
@@ -95,7 +106,12 @@ def _run(
         compile_functions(law, steps)
         if record:  # a plug-in's own use of pandas stays
             spare_pandas()
-        run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=progress)
+        ended = ""
+        try:
+            run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=progress)
+        except RunEndedError as error:
+            run = error.trajectory
+            ended = str(error)
         summary: dict[str, Any] = {
             "version": version("rti-cosim"),
             "scenario": scenario.name,
@@ -108,9 +124,11 @@ def _run(
             **run.summary(),
             "timing": run.timing_summary() | {"functions": functions_of(law)},
         }
+    if ended:
+        summary["ended"] = ended
     run.write_csv(folder / "trajectory.csv")
     run.write_timing_csv(folder / "timing.csv")
-    if 1 < steps <= DRAWN:
+    if 1 < len(run) <= DRAWN:
         run.plot(folder / "trajectory.png")
     (folder / "scenario.toml").write_text(scenario.to_toml(), "utf-8")
     return summary

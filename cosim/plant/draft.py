@@ -1,10 +1,12 @@
-"""A draft of a scenario for a foreign FMU, from its model description."""
+"""A draft of a scenario for a foreign FMU, from its model description and by stepping it."""
 
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from math import ceil, isfinite, log10
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,11 @@ import tomli_w
 from scipy.optimize import least_squares
 
 from cosim.errors import PlantError
-from cosim.plant.fmi import SHIPPED, UnpackedFmu, unpack
+from cosim.plant.fmi import SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.wiring import INTEGERS, REALS, has_start, refusals
+from cosim.plant.probe import AFTER, Kind, Report, Restart, probe
+from cosim.plant.starts import candidates, start_parameters
+from cosim.plant.wiring import INTEGERS, NO_NUMBERS, REALS, refusals
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -29,6 +33,90 @@ HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
 COSTS = ("cost", "loss", "objective")
+SHOWN = 12
+"""Inputs that a remark names at most."""
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Which variables of an FMU play which role in a scenario, by name."""
+
+    states: tuple[str, ...]
+    actions: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    stage_cost: str
+
+
+def guess_roles(
+    fmu: UnpackedFmu,
+    states: Sequence[str] = (),
+    actions: Sequence[str] = (),
+    stage_cost: str | None = None,
+) -> Roles:
+    """The roles of an FMU's variables; what is not given is guessed from its model description.
+
+    Args:
+        fmu: The FMU.
+        states: States, if known; else the continuous states, else outputs with a start parameter.
+        actions: Actions, if known; else the real inputs.
+        stage_cost: Stage cost, if known; else the output that is called a cost.
+
+    Returns:
+        The roles. Disturbances are the outputs D with a parameter D_nominal.
+
+    Raises:
+        PlantError: A name is unknown, or a role cannot be guessed; it says what to give.
+    """
+    for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
+        if fmu.variable(name) is None:
+            raise PlantError(
+                f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}"
+            )
+    noise = [name for name in _reals(fmu, "output") if f"{name}_nominal" in fmu.variables]
+    cost = stage_cost or _cost(fmu)
+    return Roles(
+        states=tuple(states) or tuple(_states(fmu, [*noise, cost])),
+        actions=tuple(actions) or tuple(_actions(fmu, noise)),
+        disturbances=tuple(noise),
+        stage_cost=cost,
+    )
+
+
+def number_roles(
+    fmu: UnpackedFmu,
+    states: Sequence[str] = (),
+    actions: Sequence[str] = (),
+    stage_cost: str | None = None,
+) -> Roles:
+    """Roles to try an FMU with where nobody can guess them; of an array its first element.
+
+    Args:
+        fmu: An FMU that is not refused.
+        states: States, if known; else all other numbers among the outputs, else the locals.
+        actions: Actions, if known; else all numbers among the inputs, else a tunable parameter.
+        stage_cost: Stage cost, if known; else the first output that is called a cost, else the
+            first output.
+    """
+
+    def names(causality: str, variability: str = "") -> tuple[str, ...]:
+        return tuple(
+            elements(variable)[0]
+            for variable in fmu.variables.values()
+            if variable.causality == causality
+            and variable.variability in (variability or variable.variability,)
+            and variable.type not in NO_NUMBERS
+        )
+
+    outputs = names("output") or names("local")
+    costs = [name for name in outputs if _is_cost(name)]
+    cost = stage_cost or (costs[0] if costs else outputs[0])
+    others = tuple(name for name in outputs if name != cost)
+    return Roles(
+        states=tuple(states) or others or outputs,
+        actions=tuple(actions) or names("input") or names("parameter", "tunable")[:1],
+        disturbances=(),
+        stage_cost=cost,
+    )
 
 
 def draft_scenario(
@@ -42,75 +130,182 @@ def draft_scenario(
     state: Sequence[float] = (),
     action: Sequence[float] = (),
 ) -> str:
-    """Text of a scenario file for an FMU, as it will stand at `target`, remarks first.
+    """Text of a scenario file for an FMU, with a remark above each value that needs one.
 
-    Roles that are not given are guessed; `state` and `action` are where the search for the steady
-    state begins. Raises PlantError, which says what to give, where nothing can be guessed.
+    Args:
+        fmu: A shipped FMU's name, or a path.
+        target: Path of the file to be; the FMU's path is written relative to it.
+        states: States, if known; see `guess_roles`.
+        actions: Actions, if known.
+        stage_cost: Stage cost, if known.
+        sampling_time: Sampling time in s; without it the FMU's own step size.
+        state: Where the search for the steady state begins, (n,); without it the FMU's start.
+        action: The same of the actions, (m,).
+
+    Returns:
+        The text, TOML.
+
+    Raises:
+        PlantError: The FMU cannot be a plant, or something cannot be guessed; it says what to give.
     """
     archive = unpack(fmu)
     for refusal in refusals(archive):
         raise PlantError(refusal)
-    known = archive.variables
-    for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
-        if name not in known:
-            raise PlantError(
-                f"FMU '{archive.path.name}' has no variable '{name}'{suggestion(name, known)}"
-            )
-    noise = [name for name in _reals(archive, "output") if f"{name}_nominal" in known]
-    cost = stage_cost or _cost(archive)
-    states = list(states) or _states(archive, [*noise, cost])
-    actions = list(actions) or _actions(archive, noise)
-    mapping = _mapping(archive, states, noise)
-    starts = [known[name] for name in mapping.get("initial_state", states)]
-    x = _start(starts, state, "state")
-    u = _start([known[name] for name in actions], action, "action")
-    limits = [_limits(known[name], value) for name, value in zip(actions, u.tolist(), strict=True)]
-    disturbance: dict[str, Any] = {"law": "none"}
-    if "nominal" in mapping and "ranges" in mapping:
-        disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
-        for field in ("nominal", "ranges"):
-            disturbance[field] = [float(known[name].start) for name in mapping[field]]
-    shipped = str(fmu) in SHIPPED
-    document: dict[str, Any] = {
-        "schema": 1,
-        "name": Path(fmu).stem,
-        "description": str(archive.description.description or archive.description.modelName),
-        "sampling_time": sampling_time or _sampling_time(archive, mapping),
-        "discount": 0.99,
-        "plant": {
-            "fmu": str(fmu) if shipped else archive.path.as_posix(),
-            "states": states,
-            "actions": actions,
-            "disturbances": noise,
-            "stage_cost": cost,
-            "initial_state": x.tolist(),
-            "mapping": mapping,
-        },
-        "disturbance": disturbance,
-        "bounds": {
-            "state_lower": [_number(known[name].min, -np.inf) for name in states],
-            "state_upper": [_number(known[name].max, np.inf) for name in states],
-            "action_lower": [low for low, _ in limits],
-            "action_upper": [high for _, high in limits],
-        },
-        "penalty": {"linear": [1.0] * len(x), "quadratic": [1.0] * len(x)},
-        "controller": _reference(x, u, 0.0),
-    }
-    with FmuPlant(Scenario.from_dict(document | {"disturbance": {"law": "none"}})) as plant:
-        x, u, found = nearest_steady_state(plant, x, u)
+    roles = guess_roles(archive, states, actions, stage_cost)
+    document = first_document(fmu, archive, roles, sampling_time, action)
+    document, remarks = _with_what_was_seen(document, archive)
+    document, more_remarks = _with_starts(document, archive, state)
+    undisturbed = document | {"disturbance": {"law": "none"}}
+    with FmuPlant(Scenario.from_dict(undisturbed)) as plant:
+        x, u, cost = nearest_steady_state(
+            plant,
+            np.array(document["plant"]["initial_state"]),
+            np.array(document["controller"]["reference_action"]),
+        )
         units = plant.units
-    weight = 10.0 ** ceil(log10(10 * max(abs(found), 1.0)) - 0.5)
+    weight = 10.0 ** ceil(log10(10 * max(abs(cost), 1.0)) - 0.5)
     document["penalty"]["linear"] = [weight] * len(x)
     document["plant"]["initial_state"] = x.tolist()
-    document["controller"] = _reference(x, u, found)
-    if shipped:
+    document["controller"] = _reference(x, u, cost)
+    if str(fmu) in SHIPPED:
         document["controller"]["model"] = f"controllers.{str(fmu).removesuffix('_fmi3')}:model"
     else:
         with suppress(ValueError):  # it is on another drive
             path = os.path.relpath(archive.path, target.resolve().parent)
             document["plant"]["fmu"] = Path(path).as_posix()
-    notes = [f"# {field}: {note}" for field, note in _comments(document, units).items()]
-    return "\n".join([HEAD, *notes, "", tomli_w.dumps(document)])
+    remarks = _remarks(document, archive, units) | remarks | more_remarks
+    return with_remarks(tomli_w.dumps(document), remarks)
+
+
+def first_document(
+    fmu: str | Path,
+    archive: UnpackedFmu,
+    roles: Roles,
+    sampling_time: float | None = None,
+    action: Sequence[float] = (),
+) -> dict[str, Any]:
+    """A scenario's document with the FMU's start values, before any of its code has run.
+
+    No start is mapped; the states' initial values are zero.
+    """
+    mapping = _mapping(archive, roles.disturbances)
+    n = len(roles.states)
+    u = _starts(archive, roles.actions, action, "action")
+    limits = [
+        action_limits(archive, name, value)
+        for name, value in zip(roles.actions, u.tolist(), strict=True)
+    ]
+    ranges = [archive.range(name) for name in roles.states]
+    disturbance: dict[str, Any] = {"law": "none"}
+    if "nominal" in mapping and "ranges" in mapping:
+        disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
+        for field in ("nominal", "ranges"):
+            disturbance[field] = [start_value(archive, name) for name in mapping[field]]
+    return {
+        "schema": 1,
+        "name": archive.path.stem if str(fmu) not in SHIPPED else str(fmu),
+        "description": str(archive.description.description or archive.description.modelName),
+        "sampling_time": sampling_time or _sampling_time(archive, mapping),
+        "discount": 0.99,
+        "plant": {
+            "fmu": str(fmu) if str(fmu) in SHIPPED else archive.path.as_posix(),
+            "states": list(roles.states),
+            "actions": list(roles.actions),
+            "disturbances": list(roles.disturbances),
+            "stage_cost": roles.stage_cost,
+            "initial_state": [0.0] * n,
+            "mapping": mapping,
+        },
+        "disturbance": disturbance,
+        "bounds": {
+            "state_lower": [low for low, _ in ranges],
+            "state_upper": [high for _, high in ranges],
+            "action_lower": [low for low, _ in limits],
+            "action_upper": [high for _, high in limits],
+        },
+        "penalty": {"linear": [1.0] * n, "quadratic": [1.0] * n},
+        "controller": _reference(np.zeros(n), u, 0.0),
+    }
+
+
+def _with_what_was_seen(
+    document: dict[str, Any], archive: UnpackedFmu
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The document with what a probe of the FMU found, and remarks on it.
+
+    Only what differs from a scenario's defaults is written: outputs that doStep computes, the
+    start time and tolerance that the file states, a stop time without which it does not run.
+    """
+    quiet = document | {"disturbance": {"law": "none"}}
+    report = probe(Scenario.from_dict(quiet))
+    plant, remarks = dict(document["plant"]), {}
+    mapping = plant.pop("mapping")  # it stands last
+    if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
+        plant["outputs"] = report.outputs
+        remarks["plant.outputs"] = _outputs_remark(report)
+    experiment = report.experiment
+    if experiment.start_time != 0.0:
+        plant["start_time"] = experiment.start_time
+        remarks["plant.start_time"] = "s; the FMU's own; CHECK: the time at which a run begins"
+    if experiment.stop_time is not None:
+        plant["stop_time"] = experiment.stop_time
+        remarks["plant.stop_time"] = (
+            "s; the FMU's own, without which it does not run; CHECK: no run goes beyond it"
+        )
+    if experiment.tolerance is not None:
+        plant["tolerance"] = experiment.tolerance
+        remarks["plant.tolerance"] = "relative, of the FMU's solver; the FMU's own"
+    switches = [name for name in report.undriven if archive.variables[name].type == "Boolean"]
+    if report.still:
+        nothing = [name for name, moves_output in report.still.items() if not moves_output]
+        alone = f", no output either by {', '.join(nothing)}," if nothing else ""
+        enable = f" such as {', '.join(switches)}" if switches else ""
+        remarks["plant.actions"] = (
+            f"CHECK: no state moves by {', '.join(report.still)}{alone} as things are; an input"
+            f"{enable} may have to be set by plant.parameters first"
+        )
+    if report.undriven:
+        pairs = [f"{name} = {start or '?'}" for name, start in report.undriven.items()]
+        more = f" and {len(pairs) - SHOWN} more" if len(pairs) > SHOWN else ""
+        inputs = ", ".join(pairs[:SHOWN]) + more
+        remarks["plant.parameters"] = (
+            f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
+        )
+    if report.restart is not Restart.RESET:
+        remarks["plant.fmu"] = f"each episode: {report.restart.value}, since no reset was proven"
+    return document | {"plant": plant | {"mapping": mapping}}, remarks
+
+
+def _outputs_remark(report: Report) -> str:
+    """What is known of the outputs that doStep computes."""
+    ends = [name for name, kind in report.kinds.items() if kind is Kind.END]
+    if not ends:
+        return "doStep computes the outputs: they are read after it"
+    return (
+        f"doStep computes the outputs; CHECK: {', '.join(ends)} belongs to the end of a sample, so "
+        "that figures that need it at its begin are refused"
+    )
+
+
+def _with_starts(
+    document: dict[str, Any], archive: UnpackedFmu, state: Sequence[float]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The document with the parameters that set the states' starts, and remarks on them."""
+    states = document["plant"]["states"]
+    parameters = start_parameters(Scenario.from_dict(document), archive)
+    missing = [name for name in states if name not in parameters]
+    remarks = {}
+    if missing and parameters:
+        remarks["plant.mapping"] = (
+            f"CHECK: no start was found for {', '.join(missing)}, so that an episode starts where "
+            "the FMU does; what was found may go into plant.parameters: "
+            + ", ".join(f"{parameter} for {name}" for name, parameter in parameters.items())
+        )
+    starts = [parameters.get(name, name) for name in states]
+    plant = document["plant"] | {"initial_state": _starts(archive, starts, state, "state").tolist()}
+    if not missing:
+        plant["mapping"] = {"initial_state": starts} | plant["mapping"]
+    return document | {"plant": plant}, remarks
 
 
 def _reference(x: Array, u: Array, cost: float) -> dict[str, Any]:
@@ -119,55 +314,103 @@ def _reference(x: Array, u: Array, cost: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _start(variables: Sequence[Any], given: Sequence[float], kind: str) -> Array:
-    if given and len(given) != len(variables):
-        names = ", ".join(variable.name for variable in variables)
-        raise PlantError(f"--{kind} takes {len(variables)} numbers ({names}), not {len(given)}")
-    return np.array(given or [_number(variable.start, 0.0) for variable in variables], dtype=float)
+def _starts(fmu: UnpackedFmu, names: Sequence[str], given: Sequence[float], kind: str) -> Array:
+    """Start values that were given, else the FMU's."""
+    if given and len(given) != len(names):
+        raise PlantError(
+            f"--{kind} takes {len(names)} numbers ({', '.join(names)}), not {len(given)}"
+        )
+    return np.array(given or [start_value(fmu, name) for name in names], dtype=float)
 
 
-def _number(stated: str | None, otherwise: float) -> float:
-    return otherwise if stated is None else float(stated)
+def start_value(fmu: UnpackedFmu, name: str) -> float:
+    """Start value of a variable or an array's element; 0 where the FMU states none."""
+    variable = fmu.variable(name)
+    stated = str(getattr(variable, "start", None) or "").split()
+    if variable is None or not stated:
+        return 0.0
+    if variable.shape and len(stated) > 1:
+        index = [int(i) for i in name[len(variable.name) + 1 : -1].split(",")]
+        return number(stated[int(np.ravel_multi_index(index, variable.shape))], 0.0)
+    return number(stated[0], 0.0)
 
 
-def _limits(variable: Any, value: float) -> tuple[float, float]:
-    """Range of an input: the FMU's, else its start value ± its magnitude."""
-    reach = abs(value) or 1.0
-    return _number(variable.min, value - reach), _number(variable.max, value + reach)
+def action_limits(fmu: UnpackedFmu, name: str, value: float) -> tuple[float, float]:
+    """Range of an action: the FMU's, and where it states none, `value` ± its magnitude.
+
+    A bound that is no bound (`UnpackedFmu.range`) counts as not stated.
+    """
+    low, high = fmu.range(name)
+    centre = min(max(value, low), high)
+    reach = abs(centre) or 1.0
+    return low if isfinite(low) else centre - reach, high if isfinite(high) else centre + reach
 
 
 def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
-    parameter = fmu.variables.get(mapping.get("sampling_time", ""))
     experiment = getattr(fmu.description.defaultExperiment, "stepSize", None)
-    stated = getattr(parameter, "start", None) or experiment
-    if not stated:
+    stated = start_value(fmu, mapping.get("sampling_time", "")) or number(experiment, 0.0)
+    if not stated > 0:
         raise PlantError(f"FMU '{fmu.path.name}' states no step size; give --sampling-time SECONDS")
-    return float(stated)
+    return stated
 
 
-def _comments(document: dict[str, Any], units: dict[str, str]) -> dict[str, str]:
+def _remarks(
+    document: dict[str, Any], fmu: UnpackedFmu, units: Mapping[str, str]
+) -> dict[str, str]:
     """Remark on each field and table by its dotted name."""
-    plant, bounds = document["plant"], document["bounds"]
-    ranges = zip(plant["states"], bounds["state_lower"], bounds["state_upper"], strict=True)
-    free = [name for name, low, high in ranges if not isfinite(low) and not isfinite(high)]
-    comments = {
+    plant = document["plant"]
+    remarks = {
         "sampling_time": "s; CHECK",
         "plant": "; ".join(f"{name} [{unit}]" for name, unit in units.items() if unit),
         "plant.stage_cost": "CHECK: a cost, not a profit",
         "plant.mapping": "each reset writes these; what the FMU has no parameter for is left out",
-        "bounds": "CHECK: states are bounded softly, by the penalty, actions hard; from min and max"
-        + (f"; CHECK: the FMU states no bound of {', '.join(free)}" if free else ""),
+        "bounds": "CHECK: states are bounded softly, by the penalty, actions hard; from min and "
+        "max",
         "penalty": "per unit of violation and sample; CHECK: must outweigh what it saves",
         "controller": "the undisturbed plant's steady state nearest to its start values; "
         "`cosim tuning` prints the cheapest one",
     }
+    free = [name for name in plant["states"] if not any(map(isfinite, fmu.range(name)))]
+    if free:
+        remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(free)}"
+    open_ended = [name for name in plant["actions"] if not all(map(isfinite, fmu.range(name)))]
+    if open_ended:
+        remarks["bounds.action_lower"] = (
+            f"CHECK: the FMU does not bound {', '.join(open_ended)} on both sides; what is missing "
+            "is its start value ± its magnitude"
+        )
     if "initial_state" not in plant["mapping"]:
-        comments["controller"] = "CHECK: the plant as it starts; it can start nowhere else"
+        remarks["controller"] = "CHECK: the plant as it starts; it can start nowhere else"
     if document["disturbance"]["law"] == "none":
-        comments["disturbance"] = f"CHECK: {NO_NOISE}"
+        remarks["disturbance"] = f"CHECK: {NO_NOISE}"
     if "model" not in document["controller"]:
-        comments["controller"] += '; add model = "my_plant:model", a model in CasADi'
-    return comments
+        remarks["controller"] += '; add model = "my_plant:model", a model in CasADi'
+    return remarks
+
+
+def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
+    """TOML text with each remark as a comment above the key or table of its dotted name.
+
+    A remark on a key that the text does not have stands above its table.
+    """
+    names = []
+    table = ""
+    for line in text.splitlines():
+        if line.startswith("["):
+            table = line.strip("[]")
+            names.append(table)
+        else:
+            key = line.partition(" =")[0]
+            names.append(f"{table}.{key}" if table else key)
+    above: dict[str, list[str]] = {}
+    for name, remark in remarks.items():
+        place = name if name in names else name.rpartition(".")[0]
+        wrapped = textwrap.wrap(remark, 98, break_on_hyphens=False)
+        above.setdefault(place, []).extend(f"# {words}" for words in wrapped)
+    lines = [HEAD, ""]
+    for name, line in zip(names, text.splitlines(), strict=True):
+        lines += [*above.pop(name, []), line]
+    return "\n".join([*lines, ""])
 
 
 def _reals(fmu: UnpackedFmu, causality: str) -> list[str]:
@@ -182,28 +425,41 @@ def _cost(fmu: UnpackedFmu) -> str:
     outputs = _reals(fmu, "output")
     if not outputs:
         raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output to draft from")
-    found = [name for name in outputs if any(word in name.lower() for word in COSTS)]
-    if len(found) == 1:
-        return found[0]
-    which = f"{' and '.join(found)} could be" if found else "none is called a cost"
+    costs = [name for name in outputs if _is_cost(name)]
+    if len(costs) == 1:
+        return costs[0]
+    which = f"{' and '.join(costs)} could be" if costs else "none is called a cost"
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say which output is the stage cost ({which}); give "
         f"--cost NAME, one of {', '.join(outputs)}"
     )
 
 
+def _is_cost(name: str) -> bool:
+    return any(word in name.lower() for word in COSTS)
+
+
 def _states(fmu: UnpackedFmu, others: Sequence[str]) -> list[str]:
     """Continuous states, else outputs with a start parameter."""
-    rates = [each for each in fmu.variables.values() if getattr(each, "derivative", None)]
+    rates = [v for v in fmu.variables.values() if getattr(v, "derivative", None) is not None]
     if rates:
-        return list(dict.fromkeys(each.derivative.name for each in rates))
+        names = [name for rate in rates for name in elements(rate.derivative)]
+        return list(dict.fromkeys(names))
     outputs = [name for name in _reals(fmu, "output") if name not in others]
-    if started := [name for name in outputs if f"{name}_start" in fmu.variables]:
+    if started := [name for name in outputs if any(candidates(fmu, name))]:
         return started
     raise PlantError(
-        f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no parameters "
-        f"NAME_start); give --states A,B,…, of {', '.join(_reals(fmu, 'output'))}"
+        f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no start "
+        f"parameters); give --states A,B,…, of {', '.join(_reals(fmu, 'output'))}"
     )
+
+
+def elements(variable: Any) -> list[str]:
+    """Name of a variable, or of each element of an array, `NAME[i,j]`, row by row."""
+    if not variable.shape:
+        return [str(variable.name)]
+    indices = np.ndindex(*variable.shape)
+    return [f"{variable.name}[{','.join(map(str, index))}]" for index in indices]
 
 
 def _actions(fmu: UnpackedFmu, noise: Sequence[str]) -> list[str]:
@@ -219,32 +475,30 @@ def _actions(fmu: UnpackedFmu, noise: Sequence[str]) -> list[str]:
     )
 
 
-def _mapping(fmu: UnpackedFmu, states: Sequence[str], noise: Sequence[str]) -> dict[str, Any]:
-    """Start values that a reset can write, by the names of our own plants."""
+def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
+    """What a reset can write beside the states' starts, by the names of our own plants."""
     known = fmu.variables
 
-    def of(name: str, types: Sequence[str]) -> bool:
-        return name in known and known[name].type in types and known[name].causality == "parameter"
+    def is_parameter(name: str, types: Sequence[str]) -> bool:
+        variable = known.get(name)
+        if variable is None or variable.shape:
+            return False
+        return variable.type in types and variable.causality == "parameter"
 
     table: dict[str, Any] = {}
-    starts = [f"{name}_start" for name in states]
-    if all(of(name, REALS) for name in starts):
-        table["initial_state"] = starts
-    elif all(has_start(known[name]) for name in states):
-        table["initial_state"] = list(states)
-    if of("seed", INTEGERS):
-        table["seed"] = [name for name in ("seed", "seedHigh") if of(name, INTEGERS)]
+    if is_parameter("seed", INTEGERS):
+        table["seed"] = [name for name in ("seed", "seedHigh") if is_parameter(name, INTEGERS)]
     for name, types in (("sampling_time", REALS), ("stochastic", ("Boolean",))):
-        if of(name, types):
+        if is_parameter(name, types):
             table[name] = name
     declared = getattr(known.get("law"), "declaredType", None)
     items = getattr(declared, "items", None) or []
     codes = {item.name: int(item.value) for item in items if item.name in ("uniform", "normal")}
-    if codes and of("law", ("Enumeration",)):
+    if codes and is_parameter("law", ("Enumeration",)):
         table |= {"law": "law", "law_codes": codes}
     for field, suffix in (("nominal", "_nominal"), ("ranges", "_range")):
         parameters = [f"{name}{suffix}" for name in noise]
-        if parameters and all(of(name, REALS) for name in parameters):
+        if parameters and all(is_parameter(name, REALS) for name in parameters):
             table[field] = parameters
     return table
 
@@ -258,11 +512,21 @@ LOOSE = 1e-6
 def nearest_steady_state(
     plant: FmuPlant, state: Array, action: Array
 ) -> tuple[Array, Array, float]:
-    """Steady state x = Φ(x, u) of the undisturbed plant near (state (n,), action (m,)).
+    """Steady state x = Φ(x, u) of the undisturbed plant near a state and an action.
 
-    Returns x, u and the stage cost there. Both x and u move in their scales, within the plant's
-    ranges, by least squares in a trust region. A plant that starts where it likes is taken as it
-    starts. Raises PlantError where there is no steady state.
+    Both x and u move in their scales, within the plant's ranges, by least squares in a trust
+    region. A plant that starts where it likes is taken as it starts.
+
+    Args:
+        plant: The plant, without noise.
+        state: Where the search begins, (n,).
+        action: The same of the actions, (m,).
+
+    Returns:
+        x, u and the stage cost there.
+
+    Raises:
+        PlantError: There is no steady state near the start.
     """
     if not plant.scenario.plant.mapping.initial_state:
         return plant.reset(0), action, plant.step(action).stage_cost
@@ -279,8 +543,8 @@ def nearest_steady_state(
     precise = {"diff_step": DIFFERENCE, "gtol": 1e-15, "ftol": None, "xtol": None}
     start = np.clip(start, *bounds)
     with np.errstate(divide="ignore", invalid="ignore"):  # SciPy's own, of a step that is lost
-        found = least_squares(residual, start, "3-point", bounds, x_scale=scale, **precise)
-    z, left = found.x, float(np.max(np.abs(found.fun)))
+        result = least_squares(residual, start, "3-point", bounds, x_scale=scale, **precise)
+    z, left = result.x, float(np.max(np.abs(result.fun)))
     if left > LOOSE:
         raise PlantError(
             f"FMU '{plant.fmu_path.name}' has no steady state near its start values (a sample "

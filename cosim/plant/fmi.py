@@ -5,18 +5,23 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import itertools
+import multiprocessing
+import os
 import shutil
 import stat
 import sys
+import tempfile
 import threading
+import warnings
 import zipfile
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from math import inf
+from math import inf, isnan
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
@@ -31,7 +36,7 @@ from fmpy.model_description import read_model_description
 from numpy.typing import NDArray
 
 import fmus
-from cosim.errors import CapabilityError, PlantError
+from cosim.errors import CapabilityError, FmuWarning, PlantError
 from cosim.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
 
@@ -50,6 +55,8 @@ class UnpackedFmu:
     folder: Path
     description: Any
     entries: frozenset[str]
+    flaws: tuple[str, ...] = ()
+    """What the model description has against FMI's schema and rules, none of which bars a run."""
 
     @cached_property
     def variables(self) -> dict[str, Any]:
@@ -66,6 +73,47 @@ class UnpackedFmu:
         variable = self.variable(name)
         stated = variable and (variable.unit or getattr(variable.declaredType, "unit", None))
         return str(stated or "")
+
+    def range(self, name: str) -> tuple[float, float]:
+        """Least and greatest value of a variable, as it or its type states; ±∞ without a bound.
+
+        Tools write numbers for "no bound": 1e60 (Modelica's infinity), DBL_MAX, 1e30, the ends of
+        an integer's type. A bound `NO_BOUND` times as large as the variable's scale is none.
+        """
+        variable = self.variable(name)
+        declared = getattr(variable, "declaredType", None)
+        scale = max(
+            1.0,
+            *(abs(number(getattr(variable, field, None), 0.0)) for field in ("start", "nominal")),
+        )
+        limits = []
+        for field, none in (("min", -inf), ("max", inf)):
+            stated = getattr(variable, field, None)
+            if stated is None:
+                stated = getattr(declared, field, None)
+            limit = number(stated, none)
+            is_end = variable is not None and variable.type not in _REALS and limit in _ENDS
+            limits.append(none if is_end or not abs(limit) < NO_BOUND * scale else limit)
+        return limits[0], limits[1]
+
+
+NO_BOUND = 1e15
+"""Ratio of a bound to a variable's scale from which it is none: a double has 15 digits."""
+_REALS = ("Real", "Float64", "Float32")
+_ENDS = {
+    float(end)
+    for bits in (8, 16, 32, 64)
+    for end in (-(1 << bits - 1), (1 << bits - 1) - 1, (1 << bits) - 1)
+}
+
+
+def number(stated: str | float | None, otherwise: float) -> float:
+    """A number as a model description states it; `otherwise` where it states none or no number."""
+    try:
+        found = otherwise if stated is None else float(stated)
+    except ValueError:
+        return otherwise
+    return otherwise if isnan(found) else found
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
@@ -117,7 +165,8 @@ def _unpack(path: Path) -> UnpackedFmu:
         raise PlantError(
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
-    return UnpackedFmu(path, digest, folder, _describe(path, folder), entries)
+    description, flaws = _describe(path, folder)
+    return UnpackedFmu(path, digest, folder, description, entries, flaws)
 
 
 def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
@@ -147,27 +196,74 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
     archive.NameToInfo = {entry.filename: entry for entry in entries}
 
 
-def _describe(path: Path, folder: Path) -> Any:
+def _describe(path: Path, folder: Path) -> tuple[Any, tuple[str, ...]]:
+    """The model description, and what it has against FMI's rules; a warning names those, once.
+
+    A description that can be read in spite of its flaws is read. Raises PlantError where it cannot,
+    or where a plant cannot be made of it.
+    """
+    flaws: tuple[str, ...] = ()
     try:
         description = read_model_description(str(folder))
     # fmpy's ValidationError, its bare Exception, and lxml's errors on text that is not XML.
     except Exception as error:
-        first, *others = getattr(error, "problems", [error])
-        more = f" ({len(others)} more)" if others else ""
-        raise PlantError(f"FMU '{path}' has an invalid model description: {first}{more}") from None
+        problems = getattr(error, "problems", [error])
+        flaws = tuple(" ".join(str(problem).split()) for problem in problems)
+        description = _describe_leniently(path, folder, flaws)
     if description.fmiVersion[:2] not in ("2.", "3."):
         raise PlantError(f"FMU '{path}' is FMI {description.fmiVersion}; 2.0 and 3.0 are supported")
+    return description, flaws
+
+
+def _describe_leniently(path: Path, folder: Path, flaws: tuple[str, ...]) -> Any:
+    """The description of an FMU that failed the validation, with a warning that names the flaws.
+
+    Raises PlantError where it cannot be read, or lacks what a run needs.
+    """
+    more = f" ({len(flaws) - 1} more)" if len(flaws) > 1 else ""
+    what_is_wrong = f"{flaws[0]}{more}"
+    try:
+        # By the file's own path, sources/buildDescription.xml is left alone.
+        description = read_model_description(str(folder / DESCRIPTION), validate=False)
+        obstacle = _obstacle(description)
+    except Exception:
+        obstacle = what_is_wrong
+    if obstacle:
+        raise PlantError(f"FMU '{path}' has an invalid model description: {obstacle}")
+    # A worker process need not repeat it.
+    if multiprocessing.parent_process() is None:
+        warnings.warn(
+            f"FMU '{path.name}' is used although its model description is flawed: {what_is_wrong}; "
+            "`cosim fmu check` lists what it found",
+            FmuWarning,
+            stacklevel=2,
+        )
     return description
+
+
+def _obstacle(description: Any) -> str:
+    """What bars any run of a description that failed its validation; empty if nothing does."""
+    interface = description.coSimulation
+    if not isinstance(description.guid, str):
+        return "it has no guid (FMI 3.0: instantiationToken)"
+    if interface is not None and not isinstance(interface.modelIdentifier, str):
+        return "its co-simulation has no modelIdentifier"
+    places: dict[str, tuple[int, str]] = {}
+    for variable in description.modelVariables:
+        place = variable.valueReference, variable.type
+        if places.setdefault(variable.name, place) != place:
+            return f"two variables are called '{variable.name}'"
+    return ""
 
 
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
-    Where others can write the user's cache, or the user cannot, it lies in a temporary folder that
-    ends with this process. Raises OSError and what zipfile raises where the archive cannot be
-    unpacked.
+    It lies in a `cosim.files.cache_folder`, whose path has no escapes in its URI, since many FMUs
+    do not read those in the URI of their resources. Raises OSError and what zipfile raises where
+    the archive cannot be unpacked.
     """
-    cache = cache_folder("fmus")
+    cache = cache_folder("fmus", plain=True)
     folder = cache / sha256
     if _holds(folder, archive):
         return folder
@@ -213,23 +309,35 @@ def library_path(fmu: UnpackedFmu) -> Path:
     folders = [platform.folder(version)]
     if version.startswith("2") and platform.tuple in _FALLBACKS:
         folders.append(_FALLBACKS[platform.tuple])
-    others = []
+    reasons = []
     for folder in folders:
         entry = f"binaries/{folder}/{identifier}{fmpy.sharedLibraryExtension}"
         if entry not in fmu.entries:
+            reasons += _instead(fmu, folder, entry)
             continue
         path = fmu.folder / entry
         made_for = platforms_of(path.read_bytes())
         if platform.tuple in made_for:
             return path
         what = f"made for {' and '.join(made_for)}" if made_for else "not a shared library"
-        others.append(f"its '{entry}' is {what}")
-    found = {name.split("/")[1] for name in fmu.entries if name.startswith("binaries/")} - {""}
-    why = "; ".join(others) or f"it has: {', '.join(sorted(found)) or 'none'}"
+        reasons.append(f"its '{entry}' is {what}")
+    files = [name.split("/") for name in fmu.entries if not name.endswith("/")]
+    filled = {parts[1] for parts in files if parts[0] == "binaries" and len(parts) > 2}
+    why = "; ".join(reasons) or f"it has: {', '.join(sorted(filled)) or 'none'}"
     raise PlantError(
         f"FMU '{fmu.path}' has no binary for {platform.tuple} ({why}); build one from its sources, "
         "the shipped FMU's by `cosim fmu build --out DIR` with a C compiler, and name that file"
     )
+
+
+def _instead(fmu: UnpackedFmu, folder: str, entry: str) -> list[str]:
+    """What a platform's folder has in place of the library; nothing where there is no folder."""
+    prefix = f"binaries/{folder}/"
+    inside = sorted(name for name in fmu.entries if name.startswith(prefix))
+    names = [name.removeprefix(prefix) for name in inside if not name.endswith("/")]
+    if names:
+        return [f"its '{prefix}' has {', '.join(names[:5])} and no {entry.removeprefix(prefix)}"]
+    return [f"its '{prefix}' is empty"] if inside else []
 
 
 WARNING, DISCARD, FATAL = 1, 2, 4
@@ -241,12 +349,15 @@ _alive: Counter[str] = Counter()
 class Place(NamedTuple):
     """Where a number is in an FMU: value reference and FMI type of its variable; of an array, which
     element, row by row, and the values that all its elements start from.
+
+    A `structural` parameter (FMI 3.0) is set in configuration mode.
     """
 
     reference: int
     type: str
     element: int = 0
     starts: tuple[float, ...] = (0.0,)
+    structural: bool = False
 
 
 class Order(IntEnum):
@@ -349,6 +460,29 @@ class FMU3ByPath(fmi3.FMU3Slave, _LoadedByPath):  # type: ignore[misc]
     """fmpy's FMI 3.0 instance."""
 
 
+@contextmanager
+def _copy_of(library: Path) -> Iterator[Path]:
+    """A copy of a library beside it, which is loaded as another one; deleted after the block."""
+    handle, name = tempfile.mkstemp(library.suffix, f".{library.stem}-", library.parent)
+    os.close(handle)
+    try:
+        yield Path(shutil.copyfile(library, name))
+    finally:
+        with suppress(OSError):  # Windows keeps a file that is loaded
+            Path(name).unlink()
+
+
+def _why_not_loaded(words: str, library: str, name: str) -> str:
+    """What keeps a library, which is there, from being loaded; `words` are the system's."""
+    missing, _, rest = words.partition(": cannot open shared object file: No such file")
+    if rest and missing != library:
+        return (
+            f"does not load: its '{name}' needs the library '{missing}', which this machine does "
+            "not have; install that"
+        )
+    return f"does not load: its '{name}' is there, but {words}"
+
+
 class Instance(ABC):
     """One co-simulation instance, called through raw function pointers and fixed buffers.
 
@@ -407,9 +541,15 @@ class Instance(ABC):
         self._do_step = self._function("DoStep")
         self._first, self._second, self._third = self._calls_of_a_step(reading)
         self._to_start = self._calls_to_start()
-        self._start_places = places = [place for place, _ in starts]
+        self._start_places = [place for place, _ in starts]
+        structural = [(place, value) for place, value in starts if place.structural]
+        self._set_structure: Callable[[], None] | None = None
+        if structural:
+            self._set_structure = self.writer(*zip(*structural, strict=True))
+        plain = [(place, value) for place, value in starts if not place.structural]
+        places = [place for place, _ in plain]
         self._starts, self._set_starts = self._exchange(places, "Set")
-        self._starts[:] = [value for _, value in starts]
+        self._starts[:] = [value for _, value in plain]
         # FMI 2 counts value references anew for each type.
         self._start_of = {place[:3]: i for i, place in enumerate(places)}
 
@@ -432,6 +572,14 @@ class Instance(ABC):
 
     def _load(self) -> Any:
         library = str(library_path(self.fmu).resolve())
+        library = str(library_path(self.fmu).resolve())
+        if self._interface.canBeInstantiatedOnlyOncePerProcess:
+            # Its memory is static and keeps what an earlier instance left: a copy has its own.
+            with _copy_of(Path(library)) as copy:
+                return self._load_library(str(copy))
+        return self._load_library(library)
+
+    def _load_library(self, library: str) -> Any:
         try:
             return self._instantiate(
                 guid=self.fmu.description.guid,
@@ -439,13 +587,15 @@ class Instance(ABC):
                 unzipDirectory=str(self.fmu.folder),
                 libraryPath=library,
             )
+        except OSError as error:
+            name = library_path(self.fmu).name
+            what = _why_not_loaded(str(error), library, name)
         # fmpy raises bare Exception when the library does not instantiate.
         except Exception as error:
-            tool = self._interface.needsExecutionTool
-            hint = "; it needs the tool that made it (needsExecutionTool)" if tool else ""
-            raise PlantError(
-                f"FMU '{self.fmu.path}' cannot be instantiated: {error}{hint}{self._log()}"
-            ) from None
+            what = f"cannot be instantiated: {error}"
+        tool = self._interface.needsExecutionTool
+        hint = "; it needs the tool that made it (needsExecutionTool)" if tool else ""
+        raise PlantError(f"FMU '{self.fmu.path}' {what}{hint}{self._log()}")
 
     def _function(self, name: str) -> Any:
         """A function pointer of our own, free of the argument types that fmpy attaches."""
@@ -463,6 +613,10 @@ class Instance(ABC):
         """Reset (if started before), write the start values, initialise and read the states."""
         if started:
             self._call("Reset", self._component)
+        if self._set_structure is not None:
+            self._call("EnterConfigurationMode", self._component)
+            self._set_structure()
+            self._call("ExitConfigurationMode", self._component)
         if self._starts:
             self._set_starts()
         for name, arguments in self._to_start:
@@ -615,7 +769,7 @@ class Instance(ABC):
         """Raise PlantError for the fault of a compiled loop."""
         names = (f"Set{self.real}", f"Get{self.real}", "DoStep", "DoStep")
         if fault == len(names):
-            self.messages.append("the FMU ended the step early")
+            self.messages.append("the FMU ended the run, or the step early")
             status = DISCARD
         self.fail(names[fault - 1], status)
 
@@ -696,12 +850,21 @@ _numbers = itertools.count()
 _logs: WeakValueDictionary[bytes, deque[str]] = WeakValueDictionary()
 
 
-def _log(_: Any, instance: bytes, status: int, category: bytes, message: bytes) -> None:
-    text = message.decode("utf-8", "replace")
-    if (log := _logs.get(instance)) is not None:
+def _log(
+    _: Any, instance: bytes | None, status: int, category: bytes | None, message: bytes | None
+) -> None:
+    """Keep a message for the error that may follow.
+
+    Some FMUs sign it with another name than the instance's, or with none: then each instance that
+    lives keeps it.
+    """
+    text = (message or b"").decode("utf-8", "replace")
+    known = _logs.get(instance or b"")
+    logs = [known] if known is not None else list(_logs.values())
+    for log in logs:
         log.append(text)
-    elif status > WARNING:
-        print(f"{instance.decode('utf-8', 'replace')}: {text}", file=sys.stderr)
+    if not logs and status > WARNING:
+        print(f"{(instance or b'FMU').decode('utf-8', 'replace')}: {text}", file=sys.stderr)
 
 
 # fmpy's proxy, which formats the variadic message, knows one Python logger per process.
@@ -850,5 +1013,6 @@ class Fmi3Instance(Instance):
         """Raise PlantError where a step ended early; `least` [s] is a time that it had to pass."""
         last = self._last_time.value
         if self._terminate.value or self._early.value or last < least:
-            self.messages.append(f"the FMU ended the step early, at {last} s")
+            what = "run" if self._terminate.value else "step early"
+            self.messages.append(f"the FMU ended the {what}, at {last} s")
             self.fail("DoStep", DISCARD)

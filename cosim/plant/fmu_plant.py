@@ -6,7 +6,7 @@ import ctypes
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import NoReturn, Self
 
@@ -80,10 +80,8 @@ class FmuPlant:
         plant = self.scenario.plant
         names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
         self.units = {name: archive.unit(name) for name in names}
-        states = [archive.variable(name) for name in plant.states]
-        lower = np.array([-inf if v.min is None else float(v.min) for v in states])
-        upper = np.array([inf if v.max is None else float(v.max) for v in states])
-        self.state_range = lower, upper
+        ranges = np.array([archive.range(name) for name in plant.states])
+        self.state_range = ranges[:, 0], ranges[:, 1]
         self.penalty = self.scenario.state_penalty
         self._seeds, self._initial = wiring.seeds, wiring.initial
         self._asked = list(plant.initial_state)

@@ -26,6 +26,7 @@ from cosim.plant.fmi import (
     Place,
     Reading,
     UnpackedFmu,
+    number,
     unpack,
 )
 from cosim.plant.wiring import REALS, Wiring, experiment, has_start, interface
@@ -146,8 +147,8 @@ def subject_of(scenario: Scenario, fmu: UnpackedFmu, wiring: Wiring) -> Subject:
 
 def _two_values(variable: Any, value: float, lower: float, upper: float) -> tuple[float, float]:
     """A value within bounds and the variable's own range, and another one."""
-    lower = max(lower, -np.inf if variable.min is None else float(variable.min))
-    upper = min(upper, np.inf if variable.max is None else float(variable.max))
+    lower = max(lower, number(variable.min, -np.inf))
+    upper = min(upper, number(variable.max, np.inf))
     if variable.type not in REALS:
         lower, upper, value = ceil(lower), floor(upper), round(value)
     value = min(max(value, lower), upper)
@@ -173,11 +174,11 @@ def bare_subject(
     outputs = tuple(outputs or [name for name in all_outputs if name not in states])
     actions = tuple(actions or [v.name for v in scalars if v.causality == "input"])
     default = fmu.description.defaultExperiment
-    stated = step or float(getattr(default, "stepSize", None) or 0.0)
-    internal = float(fmu.description.coSimulation.fixedInternalStepSize or 0.0)
+    stated = step or number(getattr(default, "stepSize", None), 0.0)
+    internal = number(fmu.description.coSimulation.fixedInternalStepSize, 0.0)
     pairs = []
     for name in actions:
-        value = float(str(known[name].start or 0).split()[0])
+        value = number(str(known[name].start or 0).split()[0], 0.0)
         reach = max(abs(value), 1.0)
         pairs.append(_two_values(known[name], value, value - reach, value + reach))
     return Subject(
@@ -319,7 +320,7 @@ def _same(one: Run | Sequence[Sample], other: Run | Sequence[Sample]) -> bool:
 def _numbers(part: Run | Sequence[Sample]) -> list[float]:
     if isinstance(part, Run):
         return [*part.states, *part.outputs, *_numbers(part.samples)]
-    return [number for sample in part for number in (*sample.states, *sample.outputs)]
+    return [value for sample in part for value in (*sample.states, *sample.outputs)]
 
 
 GENTLE = 0.02
@@ -429,9 +430,11 @@ class Probe:
     def findings(self) -> Findings:
         """When outputs are read, how an episode begins, what the FMU is told."""
         attempts = [self.subject.experiment]
-        default = getattr(self.subject.fmu.description.defaultExperiment, "stopTime", None)
-        if attempts[0].stop_time is None and default is not None:
-            attempts.append(attempts[0]._replace(stop_time=float(default)))
+        default = number(
+            getattr(self.subject.fmu.description.defaultExperiment, "stopTime", None), np.inf
+        )
+        if attempts[0].stop_time is None and np.isfinite(default):
+            attempts.append(attempts[0]._replace(stop_time=default))
         failures = []
         # An FMU may not bear what a controller would not do; nearer to the reference it may.
         for share, attempt in product((1.0, GENTLE), attempts):

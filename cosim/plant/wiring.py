@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from math import ceil, prod
+from math import ceil, isnan, nan, prod
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from cosim.plant.fmi import (
     Place,
     UnpackedFmu,
     library_path,
+    number,
     unpack,
 )
 from cosim.scenario import PlantTable, Scenario
@@ -45,15 +46,15 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
             library_path(fmu)
         except PlantError as error:
             yield str(error)
-        internal = float(simulation.fixedInternalStepSize or 0)
+        internal = number(simulation.fixedInternalStepSize, 0.0)
         count = step / internal if step and internal > 0 else 1.0
         if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
             yield (
                 f"{name} steps by multiples of {internal:g} s (fixedInternalStepSize), and the "
                 f"communication step of {step:g} s is none"
             )
-    numbers = [v for v in description.modelVariables if v.type not in _NO_NUMBERS]
-    if not any(v.causality == "input" or v.variability == "tunable" for v in numbers):
+    numbers = [v for v in description.modelVariables if v.type not in NO_NUMBERS]
+    if not any(_can_act(variable) for variable in numbers):
         yield (
             f"{name} has no input and no tunable parameter that is a number: there is nothing for "
             "a controller to act on"
@@ -64,7 +65,7 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
 
 _WIDE = ("Int64", "UInt64")
 INTEGERS = ("Integer", "Int32", "UInt32", *_WIDE)
-_NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
+NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
 
 
 def has_start(variable: Any) -> bool:
@@ -87,8 +88,8 @@ def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
     A default stop time is left out: a run may well go on beyond it.
     """
     default = fmu.description.defaultExperiment
-    start = float(getattr(default, "startTime", None) or 0.0)
-    tolerance = float(getattr(default, "tolerance", None) or 0.0) or None
+    start = number(getattr(default, "startTime", None), 0.0)
+    tolerance = number(getattr(default, "tolerance", None), 0.0) or None
     if plant is None:
         return Experiment(start, None, tolerance)
     if plant.start_time is not None:
@@ -112,7 +113,6 @@ class Wiring:
         self._scenario, self._fmu, plant = scenario, fmu, scenario.plant
         self.interface = interface(fmu)
         self.experiment = experiment(fmu, plant)
-        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
         self.outputs = self._numbers((plant.stage_cost, *plant.disturbances), "plant")
         self.states = self._numbers(plant.states, "plant.states")
         self.initial = self._numbers(plant.mapping.initial_state, "plant.mapping.initial_state")
@@ -122,6 +122,9 @@ class Wiring:
                 self.seeds.append(self._place(name, "plant.mapping.seed", _no_word))
         self.start_names: list[str] = []
         self.starts = self._starts()
+        self._require_whole_arrays([place for place, _ in self.starts])
+        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
+        self._require_whole_arrays(self.inputs)
 
     def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
         """By the number of a sample the places to write at its start, and the values."""
@@ -132,6 +135,8 @@ class Wiring:
             for name, value in change.parameters.items():
                 places.append(self._place(name, "plant.changes", _not_written))
                 values.append(value)
+        for places, _ in found.values():
+            self._require_whole_arrays(places)
         return found
 
     def _numbers(self, names: Sequence[str], table: str) -> list[Place]:
@@ -182,7 +187,7 @@ class Wiring:
                 f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}, "
                 f"which {asked}"
             )
-        what, shape, index = misfit(variable), tuple(variable.shape or ()), 0
+        what, shape, index = misfit(variable), self._shape(variable), 0
         if shape and not what:
             try:
                 indices = name.removeprefix(variable.name).removeprefix("[").removesuffix("]")
@@ -192,17 +197,68 @@ class Wiring:
                 what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
         if what:
             raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
-        stated = ["0"] if variable.type in _NO_NUMBERS else str(variable.start or 0).split()
-        starts = tuple(map(float, stated)) * (prod(shape) // len(stated))
-        return Place(int(variable.valueReference), str(variable.type), index, starts)
+        structural = variable.causality == "structuralParameter"
+        starts = _start_values(variable, prod(shape)) or (nan,) * prod(shape)
+        reference = int(variable.valueReference)
+        return Place(reference, str(variable.type), index, starts, structural)
+
+    def _require_whole_arrays(self, places: Sequence[Place]) -> None:
+        """Raise PlantError where an array whose start values are not known is set in part."""
+        unknown = [place for place in places if any(map(isnan, place.starts))]
+        for place in unknown:
+            named = {other.element for other in unknown if other[:2] == place[:2]}
+            if len(named) < len(place.starts):
+                name = next(
+                    variable.name
+                    for variable in self._fmu.variables.values()
+                    if (variable.valueReference, variable.type) == place[:2]
+                )
+                raise PlantError(
+                    f"array '{name}' of FMU '{self._fmu.path.name}' has {len(place.starts)} "
+                    "elements by plant.parameters, for which its description states no start "
+                    f"values: scenario '{self._scenario.name}' must name each where it names one"
+                )
+
+    def _shape(self, variable: Any) -> tuple[int, ...]:
+        """Shape of a variable, by the structural parameters as the scenario sets them."""
+        parameters = self._scenario.plant.parameters
+        shape = []
+        for dimension in variable.dimensions:
+            size = dimension.start
+            if size is None:
+                by = dimension.variable
+                size = parameters.get(by.name, number(by.start, 0.0))
+            shape.append(int(size))
+        return tuple(shape)
+
+
+def _start_values(variable: Any, size: int) -> tuple[float, ...] | None:
+    """Start values of a variable of so many elements; None where it states another number of them.
+
+    That is so where a structural parameter gives an array another size.
+    """
+    stated = ["0"] if variable.type in NO_NUMBERS else str(variable.start or 0).split()
+    if size == 1:  # its name gives all of it
+        stated = stated[:1]
+    elif len(stated) == 1:
+        stated *= size
+    if len(stated) != size:
+        return None
+    return tuple(number(text, 0.0) for text in stated)
 
 
 def _no_number(variable: Any) -> str:
-    return f"is {_a(variable.type)}, not a number" if variable.type in _NO_NUMBERS else ""
+    return f"is {_a(variable.type)}, not a number" if variable.type in NO_NUMBERS else ""
+
+
+def _can_act(variable: Any) -> bool:
+    """Whether a variable can be written between two steps; a structural parameter cannot."""
+    tunable = variable.variability == "tunable" and variable.causality == "parameter"
+    return tunable or bool(variable.causality == "input")
 
 
 def _not_written(variable: Any) -> str:
-    if variable.causality != "input" and variable.variability != "tunable":
+    if not _can_act(variable):
         return f"is {_a(variable.causality)}, not an input, and is not tunable"
     return _no_number(variable)
 
@@ -222,15 +278,15 @@ def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
     Raises PlantError for anything but an integer in [0, 2⁶⁴).
     """
     try:
-        number = operator.index(seed)
+        integer = operator.index(seed)
     except TypeError:
-        number = -1
-    if not 0 <= number < 1 << 64:
+        integer = -1
+    if not 0 <= integer < 1 << 64:
         raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
     words, shift = [], 0
     for place in places:
         bits = 64 if place.type in _WIDE else 32
-        words.append((place, number >> shift & (1 << bits) - 1))
+        words.append((place, integer >> shift & (1 << bits) - 1))
         shift += bits
     return words
 

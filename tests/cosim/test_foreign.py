@@ -11,7 +11,7 @@ import pytest
 
 import fmus
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import CapabilityError, PlantError, ScenarioError
+from cosim.errors import CapabilityError, FmuWarning, PlantError, ScenarioError
 from cosim.plant.fmi import unpack
 from tests.helpers.command import run_cosim
 from tests.helpers.kinds import REALS, build_kind, scenario_for
@@ -177,7 +177,7 @@ def test_a_step_that_ends_the_simulation_is_an_error(tmp_path):
     scenario = scenario_for(tmp_path, build_kind(tmp_path, 3), fault=13)
     with FmuPlant(scenario) as plant:
         plant.reset(0)
-        with pytest.raises(PlantError, match="ended the step early"):
+        with pytest.raises(PlantError, match=r"the FMU ended the run, at 0\.5 s"):
             plant.step([1.0])
 
 
@@ -332,3 +332,54 @@ def test_an_archive_with_backslashes_runs(tmp_path, version):
     fmu = build_kind(tmp_path, version, separator="\\")
     assert trajectory(scenario_for(tmp_path, fmu)) == expected()
     assert (unpack(fmu).folder / "resources" / "readme.txt").read_bytes() == b"nothing"
+
+
+def test_a_flawed_description_is_read_with_a_warning_and_runs(tmp_path, version):
+    flawed = edited(
+        build_kind(tmp_path, version),
+        tmp_path / "flawed.fmu",
+        lambda text: text.replace('name="u"', 'name="u" colour="red"'),
+    )
+    with pytest.warns(FmuWarning, match=r"'flawed\.fmu' is used although .*'colour'"):
+        archive = unpack(flawed)
+    assert len(archive.flaws) == 1
+    assert trajectory(scenario_for(tmp_path, flawed)) == expected()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('="{kinds}"', '="{kinds}" x="y"', ""),
+        (' guid="{kinds}"', "", "it has no guid"),
+        (' modelIdentifier="kinds"', "", "its co-simulation has no modelIdentifier"),
+        ('name="range"', 'name="x_start"', "two variables are called 'x_start'"),
+        ("</ModelVariables>", "", "tag mismatch"),
+    ],
+)
+def test_what_a_run_needs_is_asked_for_even_so(tmp_path, old, new, words):
+    fmu = tmp_path / "other.fmu"
+    edited(build_kind(tmp_path, 2), fmu, lambda text: text.replace(old, new))
+    if not words:
+        with pytest.warns(FmuWarning):
+            unpack(fmu)
+        return
+    with pytest.raises(PlantError, match=f"invalid model description: .*{words}"):
+        unpack(fmu)
+
+
+def test_a_library_that_lacks_another_one_says_which(tmp_path):
+    cc = ["cc", "-shared", "-fPIC", "-x", "c", "-", "-o"]
+    build = {"input": b"int other(void) { return 1; }", "cwd": tmp_path}
+    subprocess.run([*cc, "libother.so"], check=True, **build)
+    link = ["-Wl,--no-as-needed", "-L.", "-lother"]
+    subprocess.run([*cc, "kinds.so", "-x", "none", *link], check=True, **build)
+    (tmp_path / "libother.so").unlink()
+    fmu = build_kind(tmp_path, 2, data=(tmp_path / "kinds.so").read_bytes())
+    with pytest.raises(PlantError, match=r"does not load: its 'kinds\.so' needs .* 'libother\.so'"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_the_resources_lie_where_a_uri_needs_no_escapes(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "ca che é"))
+    folder = unpack(build_kind(tmp_path, 2)).folder
+    assert folder.as_uri() == f"file://{folder}"

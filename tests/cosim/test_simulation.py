@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
+from cosim.errors import PlantError, RunEndedError
 from cosim.plugins import build_controller
 from cosim.simulation import PART, indicators, input_effort, spawn_seeds
 from cosim.trajectory import FALLBACK
@@ -170,3 +171,38 @@ def test_a_controller_that_rests_on_its_bound_does_not_violate_it():
         run = simulate(plant, build_controller("tuned", nominal), 300, 0)
     assert np.mean(run["violation"] > 0) > 0.2, "rounds nowhere below the bound: proves nothing"
     assert indicators(run)["violating_share"] == 0.0
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_plant_that_fails_in_mid_run_leaves_the_samples_before(paper, compiled):
+    """Seven samples, then the FMU says no: in either loop they are those of a run of seven."""
+
+    class Ending(FmuPlant):
+        def step(self, a):
+            if self.k == 7:
+                raise PlantError("out of water")
+            return super().step(a)
+
+        def drive(self, loop, table):
+            for row in table:
+                step = self.step(paper.reference_action)
+                row[:] = [*paper.initial_state, *paper.reference_action, step.stage_cost,
+                          *step.disturbance, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]  # fmt: skip
+            return self.state
+
+    class Compiled(Hold):
+        def compiled_loop(self, scenario):
+            return "a loop"
+
+    law = (Compiled if compiled else Hold)(paper.reference_action)
+    with FmuPlant(paper) as plant:
+        expected = simulate(plant, Hold(paper.reference_action), 7, 0)
+    with Ending(paper) as plant, pytest.raises(RunEndedError) as caught:
+        simulate(plant, law, 10, 0)
+    assert str(caught.value) == "out of water; the run ended after 7 of 10 samples"
+    run = caught.value.trajectory
+    assert len(run) == 7
+    np.testing.assert_array_equal(run["stage_cost"], expected["stage_cost"])
+    if not compiled:
+        np.testing.assert_array_equal(run.states, expected.states)
+        np.testing.assert_array_equal(run.final_state, expected.final_state)

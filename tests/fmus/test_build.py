@@ -15,7 +15,9 @@ import pytest
 
 import fmus
 from benchmarks import importers
-from fmus import build, check, evaporator
+from cosim.plant.check import check_plant
+from cosim.plant.probe import Restart
+from fmus import build, evaporator
 from fmus.build import compilers
 from tests.helpers import crosscheck
 from tests.helpers.compiler import needs_compiler
@@ -117,7 +119,10 @@ def test_every_installed_importer_passes(name: str) -> None:
     assert all(f.status == importers.PASSED for f in findings if f.tool in ("fmpy", "casadi"))
 
 
-def test_the_shipped_files_pass(version: int) -> None:
-    findings = check.check(fmus.path(fmus.NAMES[version - 2]))
-    assert [f.status for f in findings] == ["passed"] * 3
-    assert "all finite" in findings[-1].detail
+@pytest.mark.parametrize("name", (*fmus.NAMES, *fmus.PLANTS))
+def test_the_shipped_files_can_be_plants(name: str) -> None:
+    found = check_plant(name)
+    assert (found.usable, found.remarks) == (True, ())
+    assert found.report is not None
+    assert (found.report.restart, found.report.still) == (Restart.RESET, {})
+    assert found.report.snapshots and found.report.serialises

@@ -8,6 +8,8 @@ import pytest
 
 import fmus
 from tests.helpers.compiler import needs_compiler
+from tests.helpers.kinds import build_kind
+from tests.helpers.tank import edited
 
 
 def test_info_as_json(cosim):
@@ -38,20 +40,35 @@ def test_info_on_200_000_variables_takes_seconds(cosim, tmp_path):
     assert len(json.loads(out)["variables"]) > 200_000
 
 
-def test_check_runs_the_fmu_and_ends_with_0(cosim):
+def test_check_says_that_a_plant_can_be_one_and_how(cosim):
     code, out, _ = cosim("fmu", "check")
     assert code == 0
-    assert "all finite" in out
-
-
-def test_failed_check_ends_with_1(cosim, monkeypatch):
-    from fmus import check
-
-    failed = check.Finding("subject", "failed", "why")
-    monkeypatch.setattr(check, "check", lambda path: [failed])
+    assert out.splitlines()[-1] == "it can be a plant"
     code, out, _ = cosim("fmu", "check", "--json")
-    assert code == 1
-    assert json.loads(out) == {"passed": False, "checks": [vars(failed)]}
+    found = json.loads(out)
+    assert (code, found["usable"], found["remarks"]) == (0, True, [])
+    assert found["outputs"] == "before-step"
+    assert sorted(found["undriven_inputs"]) == ["F1_in", "T1_in", "T200_in", "X1_in"]
+
+
+def test_check_ends_with_1_where_it_cannot_be_one(cosim, tmp_path):
+    face = 'ModelExchange modelIdentifier="kinds"'
+    for fmu, words in (
+        (build_kind(tmp_path, 2, face=face), "has no co-simulation interface"),
+        (build_kind(tmp_path, 3, data=b"text"), "is not a shared library"),
+    ):
+        code, out, _ = cosim("fmu", "check", fmu)
+        assert code == 1
+        assert words in out.splitlines()[-1]
+
+
+def test_check_reads_what_is_flawed_and_lists_the_flaws(cosim, tmp_path):
+    fmu = build_kind(tmp_path, 2)
+    edited(fmu, tmp_path / "flawed.fmu", lambda text: text.replace('"u"', '"u" colour="red"'))
+    code, out, err = cosim("fmu", "check", tmp_path / "flawed.fmu", "--sampling-time", 0.5)
+    assert (code, err) == (0, "")
+    assert "attribute 'colour' is not allowed" in out
+    assert out.splitlines()[-1].startswith("it can be a plant")
 
 
 @needs_compiler

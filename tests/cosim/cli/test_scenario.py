@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario
+from tests.helpers.kinds import REALS, build_kind
 from tests.helpers.tank import build_tank, edited
 
 pytestmark = pytest.mark.usefixtures("unwatched")
@@ -81,7 +82,7 @@ def test_what_cannot_be_guessed_is_asked_for(cosim, tank, tmp_path):
     for old, new, words in (
         ('name="cost"', 'name="outflow"', "give --cost NAME, one of x, outflow"),
         ('name="x"', 'name="other_cost"', "other_cost and cost could be"),
-        ('name="x_start"', 'name="x0"', "--states A,B"),
+        ('name="x_start"', 'name="level0"', "--states A,B"),
         ('"input"><Real start="0"', '"local"><Real', "has no input and no tunable parameter"),
         ('causality="output"', 'causality="local"', "no scalar real output"),
     ):
@@ -101,3 +102,73 @@ def test_a_plant_that_starts_where_it_likes_has_its_reference_there(cosim, tank,
     assert drafted["controller"]["reference_action"] == [2.0]
     with FmuPlant(Scenario.load(tmp_path / "o.toml")) as plant:
         assert drafted["controller"]["reference_state"] == plant.reset(0).tolist()
+
+
+@pytest.mark.parametrize(
+    ("state", "parameter"),
+    [
+        ("c", "c_start"),
+        ("reactor.c[1]", "reactor.c_start[1]"),
+        ("A[1,2]", "A_start[1,2]"),
+        ("tank.medium.T", "tank.T_start"),
+        ("HeatCapacity1.p1.T", "HeatCapacity1.T0"),
+        ("x", "xInit"),
+        ("x", "initial_x"),
+    ],
+)
+def test_a_start_parameter_is_found_by_the_names_that_tools_give_it(
+    cosim, tmp_path, state, parameter
+):
+    words = (init(tmp_path, state, parameter), "--states", state, "--sampling-time", 0.5)
+    code, out, err = cosim("scenario", "init", *words, "--json")
+    assert code == 0, err
+    assert json.loads(out)["plant"]["mapping"]["initial_state"] == [parameter]
+
+
+def init(folder, state, parameter):
+    """A kind whose state and start parameter have these names."""
+    names = {'"x"': f'"{state}"', '"x_start"': f'"{parameter}"'}
+
+    def renamed(text):
+        for old, new in names.items():
+            text = text.replace(old, new)
+        return text
+
+    return edited(build_kind(folder, 2), folder / "renamed.fmu", renamed)
+
+
+def test_a_parameter_that_does_not_set_the_start_is_not_taken_for_one(cosim, tmp_path):
+    """The range is called x_start here, and the state starts at 1 whatever it is."""
+    fmu = build_kind(
+        tmp_path, 2, reals=REALS.replace("x_start 3", "x_begin 3").replace("range", "x0")
+    )
+    words = ("--states", "x", "--sampling-time", 0.5, "--json")
+    code, out, err = cosim("scenario", "init", fmu, *words)
+    assert code == 0, err
+    assert json.loads(out)["plant"]["mapping"]["initial_state"] == []
+
+
+@pytest.mark.parametrize("none", ["1e60", "1.7976931348623157e308", "1e30", "INF"])
+def test_a_number_that_stands_for_no_bound_is_none(cosim, tmp_path, none):
+    bounds = f'<Real start="2" min="-{none}" max="{none}"/>'
+    other = edited(
+        build_kind(tmp_path, 2),
+        tmp_path / "free.fmu",
+        lambda text: text.replace('<Real start="0"/>', bounds, 1),
+    )
+    code, out, err = cosim("scenario", "init", other, "--sampling-time", 0.5)
+    assert code == 0, err
+    drafted = Scenario.load(tmp_path / "free.toml")
+    assert (drafted.action_lower.tolist(), drafted.action_upper.tolist()) == ([0.0], [4.0])
+    assert "does not bound u on both sides" in out
+
+
+def test_a_draft_names_what_moves_nothing_and_what_nobody_drives(cosim, tmp_path):
+    """The range multiplies the seed, which is 0: as an action it moves nothing."""
+    reals = REALS.replace("range 4  parameter  fixed", "range 4  input -")
+    fmu = build_kind(tmp_path, 2, reals=reals)
+    words = (fmu, "--sampling-time", 0.5, "--actions", "range", "--overwrite")
+    code, out, err = cosim("scenario", "init", *words)
+    assert code == 0, err
+    assert "CHECK: no state moves by range" in out
+    assert "CHECK: nobody drives u = 0" in out

@@ -1,0 +1,254 @@
+"""Whether an FMU can be a plant, and how: what it states, and what was seen by trying it."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import fmus
+from cosim.errors import CosimError, PlantError
+from cosim.plant.draft import first_document, guess_roles, number_roles
+from cosim.plant.fmi import DESCRIPTION, SHIPPED, UnpackedFmu, number, unpack
+from cosim.plant.fmu_plant import FmuPlant
+from cosim.plant.probe import AFTER, Report, Row, probe
+from cosim.plant.starts import start_parameters
+from cosim.plant.wiring import REALS, refusals
+from cosim.scenario import Scenario
+from fmus import FmuError
+from fmus.check import information, problems_of
+
+SAMPLES = 20
+"""Steps of the run with the start values held."""
+SHOWN = 5
+"""Names of a row at most."""
+
+
+@dataclass(frozen=True)
+class PlantCheck:
+    """What `check_plant` found.
+
+    `usable` and `verdict` say whether the FMU can be a plant, `rows` what was looked at, what was
+    seen and what follows. `remarks` are what the model description has against FMI's rules, which
+    bears on other tools. `report` is the probe's, None where the FMU cannot be tried at all.
+    """
+
+    fmu: Path
+    usable: bool
+    verdict: str
+    rows: tuple[Row, ...]
+    remarks: tuple[str, ...] = ()
+    report: Report | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same as numbers, words and lists, for JSON."""
+        document: dict[str, Any] = {
+            "fmu": str(self.fmu),
+            "usable": self.usable,
+            "verdict": self.verdict,
+            "rows": [asdict(row) for row in self.rows],
+            "remarks": list(self.remarks),
+        }
+        if self.report is not None:
+            report = self.report
+            document |= {
+                "sha256": report.sha256,
+                "outputs": report.outputs,
+                "kinds": {name: kind.name.lower() for name, kind in report.kinds.items()},
+                "restart": report.restart.name.lower(),
+                "snapshots": report.snapshots,
+                "serialises": report.serialises,
+                "experiment": report.experiment._asdict(),
+                "actions_that_move_no_state": list(report.still),
+                "undriven_inputs": report.undriven,
+            }
+        return document
+
+
+def check_plant(
+    fmu: str | Path,
+    *,
+    states: Sequence[str] = (),
+    actions: Sequence[str] = (),
+    stage_cost: str | None = None,
+    sampling_time: float | None = None,
+) -> PlantCheck:
+    """Find out whether an FMU can be a plant, and how. This runs its native code.
+
+    Args:
+        fmu: A shipped FMU's name, or a path.
+        states: States, if known; see `cosim.plant.draft.guess_roles`.
+        actions: Actions, if known.
+        stage_cost: Stage cost, if known.
+        sampling_time: Sampling time in s; without it the FMU's own step size.
+
+    Returns:
+        A table of what was found, and the verdict.
+
+    Raises:
+        CosimError: The file is missing or is no FMU, or a name is not one of its variables.
+    """
+    path = (fmus.path(str(fmu)) if str(fmu) in SHIPPED else Path(fmu)).absolute()
+    _require_fmu(path)
+    try:
+        archive = unpack(path)
+    except PlantError as error:
+        return PlantCheck(path, False, f"it cannot be a plant: {error}", ())
+    about = information(path, archive.description)
+    remarks = tuple(problems_of(archive.folder))
+    rows = [_interfaces(about), _platforms(about), _description(remarks)]
+    if reasons := list(refusals(archive)):
+        return PlantCheck(
+            path, False, f"it cannot be a plant: {'; '.join(reasons)}", tuple(rows), remarks
+        )
+    document, roles = _document(path, archive, states, actions, stage_cost, sampling_time)
+    rows += [roles, _step_size(archive, document["sampling_time"])]
+    try:
+        scenario = Scenario.from_dict(document)
+        report = probe(scenario)
+        rows += _probed(report)
+        rows += [_starts(scenario, archive), _run(scenario)]
+    except CosimError as error:
+        return PlantCheck(path, False, f"it cannot be a plant: {error}", tuple(rows), remarks)
+    return PlantCheck(path, True, _verdict(report), tuple(rows), remarks, report)
+
+
+def _require_fmu(path: Path) -> None:
+    """Raise FmuError where there is no file, or no archive with a model description."""
+    if not path.is_file():
+        raise FmuError(f"there is no file {path}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except Exception as error:  # of damaged bytes zipfile raises a dozen types
+        raise FmuError(f"{path} is not an FMU: {error}") from None
+    if DESCRIPTION not in names:
+        raise FmuError(f"{path} is not an FMU: it has no {DESCRIPTION}")
+
+
+def _interfaces(about: dict[str, Any]) -> Row:
+    words = f"FMI {about['fmi_version']}: {', '.join(about['interfaces']) or 'none'}"
+    used = "co-simulation is used" if "co-simulation" in about["interfaces"] else ""
+    return Row("interfaces", words, used)
+
+
+def _platforms(about: dict[str, Any]) -> Row:
+    words = [
+        f"{folder} ({', '.join(made_for)})" if made_for else folder
+        for folder, made_for in about["platforms"].items()
+    ]
+    return Row("platforms", ", ".join(words) or "none", "")
+
+
+def _description(remarks: Sequence[str]) -> Row:
+    if not remarks:
+        return Row("model description", "no flaw was found", "")
+    count = f"{len(remarks)} remark{'s' if len(remarks) > 1 else ''}, listed below"
+    return Row("model description", count, "other tools may mind; the plant does not")
+
+
+def _document(
+    path: Path,
+    archive: UnpackedFmu,
+    states: Sequence[str],
+    actions: Sequence[str],
+    stage_cost: str | None,
+    sampling_time: float | None,
+) -> tuple[dict[str, Any], Row]:
+    """A scenario to try the FMU with, and a row of the roles in it.
+
+    Its other real outputs stand as disturbances. Where nobody can guess the roles, all outputs are
+    states.
+    """
+    known = [name for name in (*states, *actions, stage_cost) if name]
+    try:
+        roles = guess_roles(archive, states, actions, stage_cost)
+        still_to_say = ""
+    except PlantError as error:
+        if any(archive.variable(name) is None for name in known):
+            raise
+        roles = number_roles(archive, states, actions, stage_cost)
+        still_to_say = str(error)
+    stated = number(getattr(archive.description.defaultExperiment, "stepSize", None), 0.0)
+    internal = number(archive.description.coSimulation.fixedInternalStepSize, 0.0)
+    step = sampling_time or stated or internal or 1.0
+    document = first_document(path, archive, roles, step)
+    others = [
+        name
+        for name, variable in archive.variables.items()
+        if variable.causality == "output" and variable.type in REALS and not variable.shape
+    ]
+    document["plant"]["disturbances"] = [
+        name for name in others if name not in (*roles.states, roles.stage_cost)
+    ]
+    document["plant"]["mapping"] = {}
+    document["disturbance"] = {"law": "none"}
+    words = f"states {_some(roles.states)}; actions {_some(roles.actions)}; cost {roles.stage_cost}"
+    return document, Row(
+        "roles", words, still_to_say or "as `cosim scenario init` would draft them"
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" … ({len(names)} in all)" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
+
+
+def _step_size(archive: UnpackedFmu, step: float) -> Row:
+    default = number(getattr(archive.description.defaultExperiment, "stepSize", None), 0.0)
+    internal = number(archive.description.coSimulation.fixedInternalStepSize, 0.0)
+    words = [f"default {default:g} s"] if default > 0 else ["none stated"]
+    if internal > 0:
+        words.append(f"fixed internal step {internal:g} s")
+    follows = f"tried with {step:g} s"
+    if not default > 0:
+        follows += "; the sampling time is yours to say"
+    if internal > 0:
+        follows += f"; every communication step is a multiple of {internal:g} s"
+    return Row("step size", ", ".join(words), follows)
+
+
+def _probed(report: Report) -> list[Row]:
+    """The probe's rows; that of the outputs with their names by kind, its start state left out."""
+    by_kind: dict[str, list[str]] = {}
+    for name, kind in report.kinds.items():
+        by_kind.setdefault(kind.value, []).append(name)
+    said = "; ".join(f"{_some(names)}: {words}" for words, names in by_kind.items())
+    rows = [row for row in report.rows if row.subject != "start state"]
+    return [
+        Row(row.subject, said, row.consequence) if row.subject == "outputs" else row for row in rows
+    ]
+
+
+def _starts(scenario: Scenario, archive: UnpackedFmu) -> Row:
+    parameters = start_parameters(scenario, archive)
+    missing = [name for name in scenario.plant.states if name not in parameters]
+    words = [f"{name} by {parameter}" for name, parameter in parameters.items()]
+    if missing:
+        words.append(f"nothing sets {_some(missing)}")
+    follows = "episodes start where the FMU does" if missing else "episodes can start anywhere"
+    return Row("start state", _some(words), follows)
+
+
+def _run(scenario: Scenario) -> Row:
+    """Steps with the start values held; raises PlantError where the FMU fails."""
+    with FmuPlant(scenario) as plant:
+        plant.reset(0)
+        action = scenario.saturate(scenario.reference_action)
+        for _ in range(SAMPLES):
+            state = plant.step(action).s
+    shown = ", ".join(f"{value:.4g}" for value in state[:SHOWN])
+    return Row("run", f"{SAMPLES} steps, all numbers finite", f"then the states are {shown}")
+
+
+def _verdict(report: Report) -> str:
+    words = ["it can be a plant"]
+    if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
+        words.append('its outputs are read after the step (plant.outputs = "after-step")')
+    if report.restart.name != "RESET":
+        words.append(report.restart.value + " for each episode")
+    if report.still:
+        words.append(f"but no state moves by {_some(tuple(report.still))} as things are")
+    return "; ".join(words)

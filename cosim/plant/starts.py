@@ -1,0 +1,178 @@
+"""Which parameter sets where a state starts: guessed by its name, then proven on the FMU."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+from cosim.errors import PlantError
+from cosim.plant.fmi import Order, Reading, UnpackedFmu, number
+from cosim.plant.wiring import REALS, Wiring, has_start
+from cosim.scenario import Scenario
+
+WORDS = ("start", "init", "initial", "ini", "initialvalue", "startvalue", "t0", "0")
+"""What tools add to a state's name: `c_start` (Modelica), `T0` (20-sim), `x_initial`, `xInit`."""
+PROBED = 1e-3
+"""Share of a state's scale by which a probe moves its start."""
+AGREES = 1e-6
+"""Share of that move by which the initial state may miss the value that was asked for."""
+
+
+def start_parameters(scenario: Scenario, fmu: UnpackedFmu) -> dict[str, str]:
+    """The variable that sets each state's start, by the state's name.
+
+    A guess counts only if the FMU, initialised with it, starts at the value that was asked for. A
+    state for which no guess does is left out. This runs the FMU's native code.
+
+    Args:
+        scenario: Names the states, actions and stage cost; its mapping is not used.
+        fmu: The scenario's FMU.
+
+    Returns:
+        By state a parameter, or the state itself where its own start value can be set.
+
+    Raises:
+        PlantError: The FMU does not run as this scenario's plant.
+    """
+    states = scenario.plant.states
+    initial = dict(zip(states, _initial_states(scenario, fmu, {}, ()), strict=True))
+    parameters: dict[str, str] = {}
+    for state in states:
+        for candidate in candidates(fmu, state):
+            if candidate in parameters.values():
+                continue
+            value = _moved(fmu, state, candidate, initial[state])
+            if _starts_at(scenario, fmu, {state: candidate}, {state: value}):
+                parameters[state] = candidate
+                break
+    values = {
+        state: _moved(fmu, state, parameter, initial[state])
+        for state, parameter in parameters.items()
+    }
+    # One parameter may move another state as well: all of them together must do as asked.
+    if len(parameters) > 1 and not _starts_at(scenario, fmu, parameters, values):
+        return {}
+    return parameters
+
+
+def candidates(fmu: UnpackedFmu, state: str) -> Iterator[str]:
+    """Names of variables that may set a state's start, the likeliest first.
+
+    The start of `reactor.medium.T[2]` may be `reactor.medium.T_start[2]`, `reactor.T_start[2]`, or
+    `T_start[2]`, with any of `WORDS`; last comes the state's own start value.
+    """
+    path, base, index = split_name(state)
+    settable = [
+        name
+        for name, variable in fmu.variables.items()
+        if variable.causality in ("parameter", "structuralParameter")
+        and variable.type in REALS
+        and not variable.shape
+        and name != state
+    ]
+    while True:
+        for word in WORDS:
+            for name in settable:
+                other_path, other_base, other_index = split_name(name)
+                if (other_path, other_index) == (path, index) and _is(other_base, base, word):
+                    yield name
+        if not path:
+            break
+        path = split_name(path.removesuffix("."))[0]
+    variable = fmu.variable(state)
+    if variable is not None and has_start(variable):
+        yield state
+
+
+def split_name(name: str) -> tuple[str, str, str]:
+    """Path with its last dot, base and index of a variable: `a[1].`, `T` and `[2]` of `a[1].T[2]`.
+
+    Dots inside brackets and quotes part nothing.
+    """
+    pieces = re.findall(r"'[^']*'|\[[^\]]*\]|\.|[^.'\[]+|.", name)
+    last_dot = max((i for i, piece in enumerate(pieces) if piece == "."), default=-1)
+    path, rest = "".join(pieces[: last_dot + 1]), pieces[last_dot + 1 :]
+    index = rest.pop() if len(rest) > 1 and rest[-1].startswith("[") else ""
+    return path, "".join(rest), index
+
+
+def _is(name: str, base: str, word: str) -> bool:
+    """Whether a name is the base with the word added: `T_start`, `TStart`, `startT`, `start_T`."""
+    plain, stem = name.replace("_", "").lower(), base.replace("_", "").lower()
+    if plain == stem + word:
+        return True
+    return plain == word + stem and word.isalpha()
+
+
+def _starting_by(
+    scenario: Scenario, parameters: dict[str, str], values: Sequence[float]
+) -> Scenario:
+    """The scenario with these states alone, or with all of them and no start to be set."""
+    plant = scenario.plant
+    keep = [i for i, name in enumerate(plant.states) if not parameters or name in parameters]
+    document = scenario.to_dict()
+    for table, fields in {
+        "plant": ("states", "initial_state"),
+        "bounds": ("state_lower", "state_upper"),
+        "penalty": ("linear", "quadratic"),
+        "controller": ("reference_state",),
+    }.items():
+        for field in fields:
+            document[table][field] = [document[table][field][i] for i in keep]
+    if parameters:
+        document["plant"]["initial_state"] = list(values)
+    names = [parameters[plant.states[i]] for i in keep] if parameters else []
+    document["plant"] |= {"mapping": {"initial_state": names}, "disturbances": []}
+    document["disturbance"] = {"law": "none"}
+    return Scenario.from_dict(document)
+
+
+def _initial_states(
+    scenario: Scenario, fmu: UnpackedFmu, parameters: dict[str, str], values: Sequence[float]
+) -> list[float]:
+    """States of a new instance whose parameters have these values, after its initialisation."""
+    wiring = Wiring(_starting_by(scenario, parameters, values), fmu)
+    instance = wiring.interface(
+        fmu,
+        (wiring.inputs, wiring.outputs, wiring.states),
+        wiring.starts,
+        scenario.sampling_time,
+        Reading(Order.SET_STEP_GET),
+        wiring.experiment,
+        None,
+    )
+    try:
+        instance.initialise(started=False)
+        return list(instance.states)
+    finally:
+        instance.close([])
+
+
+def _starts_at(
+    scenario: Scenario, fmu: UnpackedFmu, parameters: dict[str, str], values: dict[str, float]
+) -> bool:
+    """Whether the FMU starts at these values of the states once the parameters have them."""
+    names = [name for name in scenario.plant.states if name in parameters]
+    asked = [values[name] for name in names]
+    try:
+        reached = _initial_states(scenario, fmu, parameters, asked)
+    except PlantError:
+        return False
+    return all(
+        abs(state - value) <= AGREES * _move(fmu, name, value)
+        for name, state, value in zip(names, reached, asked, strict=True)
+    )
+
+
+def _move(fmu: UnpackedFmu, state: str, value: float) -> float:
+    nominal = number(getattr(fmu.variable(state), "nominal", None), 0.0)
+    return PROBED * max(abs(value), abs(nominal), 1e-3)
+
+
+def _moved(fmu: UnpackedFmu, state: str, parameter: str, initial: float) -> float:
+    """A start beside the initial one, within the range of the state and of the parameter."""
+    move = _move(fmu, state, initial)
+    for value in (initial + move, initial - move):
+        if all(low <= value <= high for low, high in map(fmu.range, (state, parameter))):
+            return value
+    return initial + move

@@ -107,7 +107,8 @@ def report(
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
 
-    Of an unfinished study the finished runs are reported; a stored study may be reported, too.
+    Of an unfinished study the finished runs are reported. A stored study may be reported, too;
+    `cosim results draw` draws the figures of its single runs before.
 
     Args:
         folder: Folder of a study.
@@ -221,7 +222,7 @@ def update(
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
-    """Run studies and store their tables, figures and reports, and the folder's README.
+    """Run studies and store their tables and reports, and the folder's README.
 
     What long studies have finished is kept in the folder's `.work`; run again to go on.
 
@@ -240,6 +241,31 @@ def update(
         stored.write_readme(folder, studies)
         out_.note(f"stored {', '.join(names or studies)} in {folder.resolve()}")
         out_.json({"updated": list(names or studies)})
+
+
+@results.command()
+def draw(
+    names: NamesArgument = None,
+    folder: Annotated[Path, typer.Option("--results")] = Path("results"),
+    json: cli.JsonOption = False,
+) -> None:
+    """Draw the figures of stored studies from their tables, as NAME/figures/*.svg.
+
+    Figures are not stored. `make docs` draws all of them for the site, some minutes.
+
+    Args:
+        folder: Folder with the studies and tolerances.toml.
+    """
+    with cli.output(json) as out_:
+        from cosim.studies import stored
+
+        studies = stored.stored_studies(folder)
+        kept = [name for name in studies if (folder / name).is_dir()]
+        drawn = {}
+        for name in stored.chosen(studies, names or kept):
+            drawn[name] = stored.draw(folder, name)
+            out_.note(f"{name}: {len(drawn[name])} figures in {folder / name / 'figures'}")
+        out_.json({"figures": drawn})
 
 
 @results.command()

@@ -24,6 +24,8 @@ from cosim.files import write_atomically
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""
+FORMATS = ("svg", "png")
+"""Formats of the figures of a study."""
 FLOOR = 0.01
 """Regret in % below which an axis is linear."""
 
@@ -80,13 +82,24 @@ def save(drawn: Figure, path: str | Path) -> Path:
     return write_atomically(path, content.getvalue())
 
 
-def save_set(figures: Iterable[tuple[str, Figure]], folder: Path) -> list[str]:
-    """Write named figures into a folder, each as SVG and as PNG; returns the names."""
+def save_set(
+    figures: Iterable[tuple[str, Figure]], folder: Path, formats: Sequence[str] = FORMATS
+) -> list[str]:
+    """Write named figures into a folder.
+
+    Args:
+        figures: pairs of a name, which is the file's without suffix, and its figure.
+        folder: where they are written; made if it is not there.
+        formats: file suffixes without the dot, `svg` or `png`; a file of each is written.
+
+    Returns:
+        The names, in the order given.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     names = []
     for name, drawn in figures:
         names.append(name)
-        for suffix in ("svg", "png"):
+        for suffix in formats:
             save(drawn, folder / f"{name}.{suffix}")
     return names
 

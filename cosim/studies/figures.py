@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
+from cosim.errors import StudyError
 from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, Dots, EndLabel, Look, palette, shown_case
 from cosim.figures.training import parameters_figure
@@ -194,9 +195,21 @@ def operation_figure(
     return drawn
 
 
-def draw(plan: Plan, out: Path) -> list[str]:
-    """Draw the kept trajectories and logs into `out`/figures; returns the figures' names."""
-    return style.save_set(_figures(plan, out), out / FOLDER)
+def draw(plan: Plan, out: Path, formats: Sequence[str] = style.FORMATS) -> list[str]:
+    """Draw the trajectories and logs that a study keeps.
+
+    Args:
+        plan: the study's plan, which names the kept files.
+        out: the study's folder, or its stored one; the figures are written to `out`/figures.
+        formats: of the files, as in `save_set`.
+
+    Returns:
+        Names of the figures.
+
+    Raises:
+        StudyError: if a phase portrait needs θ of a training that `out` does not hold.
+    """
+    return style.save_set(_figures(plan, out), out / FOLDER, formats)
 
 
 def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
@@ -356,8 +369,15 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
 
 
 def _policy(run: Run, out: Path) -> Policy:
-    trained = run.training is not None
-    theta = (out / run.folder / PARAMETERS).read_text("utf-8") if trained else ""
+    theta = ""
+    if run.training is not None:
+        path = out / run.folder / PARAMETERS
+        if not path.is_file():
+            raise StudyError(
+                f"the phase portrait of '{run.case}' needs its θ, and there is no '{path}'; "
+                "run the study again"
+            )
+        theta = path.read_text("utf-8")
     controller: Controller = run.policy(theta)
 
     def act(s: Array) -> Array:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
-from cosim.figures.style import Dots, Look, palette, save_set
+from cosim.figures.style import FORMATS, Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
@@ -425,8 +425,16 @@ class StudyResults(Shown):
     def _makers(self) -> dict[str, Callable[[str], Figure | None]]:
         return {"curves": self._curves, "regret": self._regret, "operation": self._operation}
 
-    def draw(self, folder: Path) -> dict[str, list[str]]:
-        """Draw all figures into a folder; returns their names by scenario."""
+    def draw(self, folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, list[str]]:
+        """Draw the figures of the tables.
+
+        Args:
+            folder: where the files are written.
+            formats: of the files, `svg` or `png`; a file of each is written.
+
+        Returns:
+            Names of the figures by scenario.
+        """
         return {
             scenario: save_set(
                 (
@@ -435,6 +443,7 @@ class StudyResults(Shown):
                     if (drawn := maker(scenario)) is not None
                 ),
                 folder,
+                formats,
             )
             for scenario in self.scenarios
         }
@@ -532,8 +541,11 @@ class StudyResults(Shown):
             table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE)
             sections.append({"title": "All scenarios", "table": table})
         sections += [{"title": title, "table": table} for title, *table in self.further()]
-        if self.about["pictures"]:
-            sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
+        # Those of a stored study are there once `cosim results draw` has drawn them.
+        folder = self.folder / report.FOLDER
+        pictures = [name for name in self.about["pictures"] if (folder / f"{name}.svg").is_file()]
+        if pictures:
+            sections.append({"title": "Sample by sample", "figures": pictures})
         table = report.texts(self.cases.values(), report.CASES)
         sections.append({"title": "Cases", "table": table})
         made = self.about["made_with"]

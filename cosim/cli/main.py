@@ -124,15 +124,7 @@ for panel, function, example in (
 for panel, group, name, *examples in (
     (BUILD, scenario.app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
     (LEARN, study.app, "study", "run mine.toml --out study", "plan mine.toml", "report study"),
-    (
-        LEARN,
-        study.results,
-        "results",
-        "check quick",
-        "update quick",
-        "draw quick",
-        "board results/board",
-    ),
+    (LEARN, study.results, "results", "check quick", "update quick", "draw quick"),
     (BUILD, fmu.app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
 ):
     texts = [f"Example: cosim {name} {example}" for example in examples]

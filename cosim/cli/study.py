@@ -266,17 +266,3 @@ def draw(
             drawn[name] = stored.draw(folder, name)
             out_.note(f"{name}: {len(drawn[name])} figures in {folder / name / 'figures'}")
         out_.json({"figures": drawn})
-
-
-@results.command()
-def board(
-    folder: Annotated[Path, typer.Argument(help="Folder of entries.")] = Path("results/board"),
-    json: cli.JsonOption = False,
-) -> None:
-    """Check a board's entries, play their runs back, and write the board's README.md."""
-    with cli.output(json) as out_:
-        from cosim.studies.board import write_board
-
-        names = write_board(folder)
-        out_.note(f"entries: {', '.join(names)}")
-        out_.json({"entries": names})

@@ -77,7 +77,6 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("violation", _violation),
     SignalKind("value", unit=COST),
     SignalKind("residual"),
-    SignalKind("explored", whole=True),
     SignalKind("failed", whole=True),
     SignalKind("prepare_time", unit="s", group="step_time", clock=True),
     SignalKind("feedback_time", unit="s", group="step_time", clock=True),
@@ -112,9 +111,9 @@ class Trajectory(Result):
     Signals, each (K,): `time` [s]; the scenario's states, actions and disturbances under their
     FMU names; `stage_cost` ℓ(x_k, u_k, d_k) without penalty; `penalty` and `violation` Σᵢ vᵢ of
     x_k at the true bounds; the controller's `value` and `residual` (NaN if it has none);
-    `explored` (0: a run is greedy) and `failed` (0 or 1). `status` has one word per sample,
-    `fallback` where the controller failed. `timing` holds wall-clock times [s] by name, (K,);
-    `final_state` is x_K; `seed` is the noise's. `signals` maps names to signals.
+    `failed` (0 or 1). `status` has one word per sample, `fallback` where the controller failed.
+    `timing` holds wall-clock times [s] by name, (K,); `final_state` is x_K; `seed` is the noise's.
+    `signals` maps names to signals.
     """
 
     scenario: Scenario
@@ -208,14 +207,12 @@ class Trajectory(Result):
     def summary(self) -> dict[str, Any]:
         """`means` of the run and its counts; the same for the same signals.
 
-        `failures` are samples under the fallback action; `explored` is 0; `statuses` samples by
-        status.
+        `failures` are samples under the fallback action; `statuses` samples by status.
         """
         return {
             "samples": len(self),
             **self.means(),
             "failures": int(np.sum(self["failed"])),
-            "explored": int(np.sum(self["explored"])),
             "statuses": dict(sorted(Counter(self.status).items())),
             "final_state": None if self.final_state is None else self.final_state.tolist(),
         }

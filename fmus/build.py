@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.resources
 import importlib.util
 import os
 import shutil
@@ -105,7 +104,7 @@ class Compiler:
     """A C compiler for one platform: the command that calls it and the flags of its linker.
 
     `runtime` is a command that compiles the platform's C library and `empty.c`, where that is to be
-    done first. Of its files those that our FMUs do not use come in where a symbol is missing.
+    done first.
     """
 
     platform: Platform
@@ -141,39 +140,13 @@ class Compiler:
                 *self.command, *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
                 *units, "-o", file, *self.linker_flags,
             ]  # fmt: skip
-            attempts: list[dict[str, str]] = [{}]
-            if self.runtime and os.name != "nt":  # there, links need a privilege
-                attempts.insert(0, {"ZIG_LIB_DIR": str(_lean_library(folder / "zig"))})
-            for variables in attempts:
-                for step in filter(None, (self.runtime, command)):
-                    result = subprocess.run(
-                        step, cwd=folder, env=os.environ | variables, capture_output=True,
-                        text=True, check=False,
-                    )  # fmt: skip
-                if "undefined symbol" not in result.stderr:
-                    break
+            for step in filter(None, (self.runtime, command)):
+                result = subprocess.run(
+                    step, cwd=folder, capture_output=True, text=True, check=False
+                )
             if result.returncode != 0 or result.stderr:
                 raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
             return (folder / file).read_bytes()
-
-
-def _lean_library(folder: Path) -> Path:
-    """Fill `folder` with links to Zig's library, less what our FMUs do not use of Windows' part.
-
-    Those are three quarters of its C files, and most of the time of a first build.
-    """
-    own = Path(str(importlib.resources.files("ziglang"))) / "lib"
-    mingw = own / "libc" / "mingw"
-    parts = {path.parent for path in mingw.glob("*/*.c")} - {mingw / "crt", mingw / "math"}
-    opened = (own, own / "libc", mingw, *parts)
-    for source in opened:
-        target = folder / source.relative_to(own)
-        target.mkdir()
-        for path in set(source.iterdir()).difference(opened):
-            used = source not in parts or path.suffix not in (".c", ".S")
-            used = used or path.name == "dllmain.c" or path.name.startswith("ucrt_")
-            (target / path.name).symlink_to(path if used else os.devnull)
-    return folder
 
 
 def local_compiler() -> Compiler:
@@ -282,13 +255,7 @@ def _model(description: bytes) -> tuple[str, str]:
 
 # The evaporator's sources that serve any model: FMI's functions and their parts.
 _FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
-_WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
 HEADER = "variables.h"
-# Stored results name the evaporator's file by its bytes: it keeps the token of its first build.
-_KEPT_TOKENS = {
-    "{057e4cbf-b1fc-5409-a668-78ce31bbba02}": "{4b2ab9db-c6a8-56b3-80d2-38ec28c993f3}",
-    "{3acfd11f-6951-5208-9ac5-27f319c4be69}": "{71dc0d9d-04bb-5505-8f86-367bbed9bbb2}",
-}
 
 
 def files_of(folder: str) -> dict[str, bytes]:
@@ -299,7 +266,7 @@ def files_of(folder: str) -> dict[str, bytes]:
 def sources_of(model: FmuModel, version: FmiVersion) -> dict[str, bytes]:
     """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own."""
     paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
-    paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
+    paths.append(PACKAGE / "plant_sources" / "derivatives.h")
     files = {path.name: path.read_bytes() for path in paths}
     if model.sampled:
         files |= _sampled_sources(model, version)
@@ -365,8 +332,7 @@ def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes])
     digest = hashlib.sha256(model_description(version, "", model).encode())
     for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):  # they are generated
         digest.update(name.encode() + b"\0" + sources[name])
-    token = "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
-    return _KEPT_TOKENS.get(token, token)
+    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
 
 
 def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:

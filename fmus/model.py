@@ -147,10 +147,9 @@ class FmuModel:
     """A model: its name, C identifier, table of variables, interfaces and C sources.
 
     A variable's value reference is its position in the table. `step_size` [s] is that of the
-    default experiment, of 100 steps; `model_exchange` and `derivatives` (directional, in FMI 3.0
-    adjoint, too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the
-    multiples of `step_size` alone: its outputs are discrete, and no communication step may pass
-    over a sample.
+    default experiment, of 100 steps; `model_exchange` and `derivatives` (directional) say what it
+    offers beside co-simulation. Where it is `sampled`, it acts at the multiples of `step_size`
+    alone: its outputs are discrete, and no communication step may pass over a sample.
     Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
     variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
     names. `units` gives the order of the variables' units where it shall not be the table's own.

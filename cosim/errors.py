@@ -1,8 +1,23 @@
 """Errors whose message is meant for the user: `CosimError`, and those of the co-simulation."""
 
+from fmus.errors import CosimError
 
-class CosimError(Exception):
-    """Base of every error that the four packages raise on bad input or a failed run."""
+__all__ = [
+    "ArgumentError",
+    "CapabilityError",
+    "ComparisonError",
+    "ControllerLookupError",
+    "CosimError",
+    "EvaluationError",
+    "FailedRunsError",
+    "FigureError",
+    "PlantError",
+    "RecordingError",
+    "ResultsError",
+    "ScenarioError",
+    "StudyError",
+    "TrajectoryError",
+]
 
 
 class ArgumentError(CosimError, TypeError):

@@ -6,24 +6,12 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosim.errors import CosimError
+from fmus.errors import BuildError, CheckError, FmuError
 
 __all__ = ["NAMES", "PLANTS", "BuildError", "CheckError", "FmuError", "path"]
 
 NAMES = ("evaporator", "evaporator_fmi3")
 PLANTS = ("reactor", "tanks")
-
-
-class FmuError(CosimError):
-    """Base of every error that `fmus` raises for a bad input or environment."""
-
-
-class BuildError(FmuError):
-    """No usable C compiler, or the compiler refused the sources."""
-
-
-class CheckError(FmuError):
-    """The file to check is missing or is not an FMU."""
 
 
 def path(name: str = "evaporator") -> Path:

@@ -15,12 +15,13 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
 import fmpy
 
-from cosim.files import replacing, temporary_folder
 from fmus import PLATFORMS, UNIVERSAL, BuildError, Platform, present
+from fmus.files import replacing
 from fmus.model import (
     FmiVersion,
     FmuModel,
@@ -115,7 +116,8 @@ class Compiler:
     @property
     def version(self) -> str:
         """Its version, one line."""
-        with temporary_folder("cosim-") as folder:  # Zig leaves a file where it is called
+        # Zig leaves a file where it is called.
+        with TemporaryDirectory(prefix="cosim-") as folder:
             result = subprocess.run(
                 [*self.command, "--version"], cwd=folder, capture_output=True, text=True, check=True
             )
@@ -132,7 +134,8 @@ class Compiler:
         """
         headers = Path(fmpy.__file__).parent / "c-code"
         file = name + self.platform.suffix
-        with temporary_folder("cosim-") as folder:
+        with TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as name_of_folder:
+            folder = Path(name_of_folder).absolute()
             for path, data in {"empty.c": b"", **sources}.items():
                 (folder / path).write_bytes(data)
             units = sorted(path for path in sources if path.endswith(".c"))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from cosim.files import temporary_folder
 from fmus import NAMES, BuildError, plant
 from fmus.build import (
     COMPILER_FLAGS,
@@ -114,7 +114,8 @@ def differences(built: Path, shipped: Path) -> list[str]:
 
 def compare_with_shipped() -> dict[str, list[str]]:
     """Build anew for every platform; file name → `differences` from the shipped file."""
-    with temporary_folder("cosim-") as folder:
+    with TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as name:
+        folder = Path(name).absolute()
         built = [*build(folder, every_platform=True), *plant.build(folder, every_platform=True)]
         return {path.name: differences(path, PACKAGE / path.name) for path in built}
 

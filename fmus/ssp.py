@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import fmpy
-from attrs import asdict
 from fmpy.model_description import ModelDescription
 
 from fmus import BuildError
 from fmus.build import write_archive
 from fmus.model import render
+
+BASE_UNIT = ("kg", "m", "s", "A", "K", "mol", "cd", "rad", "factor", "offset")
+"""Attributes of FMI's BaseUnit."""
 
 
 def write_ssp(
@@ -44,7 +46,11 @@ def write_ssp(
             raise BuildError(f"{fmu} has no co-simulation interface")
         versions.add(description.fmiVersion[0])
         members[f"resources/{name}.fmu"] = fmu.read_bytes()
-        known = {u.name: asdict(u.baseUnit) for u in description.unitDefinitions if u.baseUnit}
+        known = {
+            unit.name: {name: getattr(unit.baseUnit, name) for name in BASE_UNIT}
+            for unit in description.unitDefinitions
+            if unit.baseUnit
+        }
         unit_of = {v.name: v.unit for v in description.modelVariables if v.unit in known}
         units |= {unit: known[unit] for each in (*inputs, *outputs) if (unit := unit_of.get(each))}
         connectors = [

@@ -1,0 +1,17 @@
+"""Errors whose message is meant for the user: the base of all, and those of FMUs."""
+
+
+class CosimError(Exception):
+    """Base of every error that the four packages raise on bad input or a failed run."""
+
+
+class FmuError(CosimError):
+    """Base of every error that `fmus` raises for a bad input or environment."""
+
+
+class BuildError(FmuError):
+    """No usable C compiler, or the compiler refused the sources."""
+
+
+class CheckError(FmuError):
+    """The file to check is missing or is not an FMU."""

@@ -3,7 +3,6 @@
 from fmus.errors import CosimError
 
 __all__ = [
-    "ArgumentError",
     "CapabilityError",
     "ComparisonError",
     "ControllerLookupError",
@@ -18,10 +17,6 @@ __all__ = [
     "StudyError",
     "TrajectoryError",
 ]
-
-
-class ArgumentError(CosimError, TypeError):
-    """A function was called with a keyword that it does not have."""
 
 
 class ScenarioError(CosimError):

@@ -22,7 +22,7 @@ from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, reporting, simulate
 from cosim.studies.run import EVALUATION, TIMING, Noise, Report, Run, Runner, to_csv
-from cosim.validation import instead, known_keywords
+from cosim.validation import instead
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +40,6 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-@known_keywords
 def evaluate(
     scenario: Scenario | str | Path,
     controllers: Mapping[str, Factory | str] | Sequence[str],

@@ -14,7 +14,6 @@ from cosim.errors import CosimError
 from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
 from cosim.scenario import Scenario
 from cosim.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
-from cosim.validation import known_keywords
 
 MEASURED = (
     "states", "actions", "stage_cost", "disturbances", "value", "residual", "failed",
@@ -41,7 +40,6 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     return int(plant.generate_state(1, np.uint64)[0]), np.random.default_rng(exploration)
 
 
-@known_keywords
 def simulate(
     plant: Plant,
     controller: Controller,

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -219,7 +218,11 @@ class Trajectory(Result):
 
     def timing_summary(self) -> dict[str, dict[str, float]]:
         """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
-        return {name: _quantiles(values) for name, values in self.timing.items()}
+        summary = {}
+        for name, seconds in self.timing.items():
+            quantiles = 1e6 * np.quantile(seconds, list(QUANTILES.values()))
+            summary[name] = dict(zip(QUANTILES, quantiles.tolist(), strict=True))
+        return summary
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
@@ -252,15 +255,6 @@ def _write(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]
     with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
         csv.writer(stream, lineterminator="\n").writerows(chain([header], rows))
     return Path(path)
-
-
-def _quantiles(seconds: Array) -> dict[str, float]:
-    # np.quantile would load numpy.ma, 3 % of a short run's processor time.
-    last, ordered = len(seconds) - 1, np.sort(seconds)
-    return {
-        key: 1e6 * float(np.interp(q * last % 1, (0, 1), ordered[[int(q * last), ceil(q * last)]]))
-        for key, q in QUANTILES.items()
-    }
 
 
 def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import gc
 import os
 import re
 import sys
@@ -177,9 +175,6 @@ def main() -> None:
     Bad input ends in one line on standard error and exit code 2, an unforeseen error in one line, a
     report with the traceback and exit code 70.
     """
-    # Passes of the collector over modules and CasADi's expressions are a fifth of a short run.
-    gc.set_threshold(100_000)
-    atexit.register(gc.freeze)
     _open_streams()
     with command_process():
         _run()

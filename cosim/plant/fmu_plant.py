@@ -27,7 +27,7 @@ from cosim.plant.fmi import (
 )
 from cosim.protocols import Array, CompiledLoop, Step
 from cosim.scenario import Scenario
-from cosim.validation import known_keywords, suggestion
+from cosim.validation import suggestion
 
 REALS = ("Real", "Float64", "Float32")
 
@@ -265,7 +265,6 @@ class FmuPlant:
     scenario names; CapabilityError once a capability that the FMU lacks is used.
     """
 
-    @known_keywords
     def __init__(
         self,
         scenario: Scenario | str | Path,

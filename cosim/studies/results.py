@@ -40,7 +40,7 @@ from cosim.studies.run import (
     to_csv,
     typed,
 )
-from cosim.validation import instead, known_keywords
+from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
@@ -671,7 +671,6 @@ def document(plan: Plan) -> dict[str, Any]:
     return dict(json.loads(json.dumps(about)))
 
 
-@known_keywords
 def study(
     source: Study | str | Path | Mapping[str, Any],
     out: str | Path,

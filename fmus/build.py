@@ -126,23 +126,37 @@ class Compiler:
     def library(
         self, sources: Mapping[str, bytes], name: str, warnings: tuple[str, ...] = WARNINGS
     ) -> bytes:
-        """Compile every ``*.c`` of `sources`, files by name, into one shared library.
+        """Compile every ``*.c`` of the sources into one shared library.
 
-        `name` is the library's, without suffix; the FMI headers are fmpy's. Returns its bytes.
-        Raises BuildError with the compiler's words on anything that it says; `warnings` chooses
-        what it warns of.
+        Args:
+            sources: files by name; the FMI headers are fmpy's.
+            name: the library's name, without suffix.
+            warnings: compiler options that choose what it warns of.
+
+        Returns:
+            The library's bytes.
+
+        Raises:
+            BuildError: with the compiler's words, on anything that it says.
         """
         headers = Path(fmpy.__file__).parent / "c-code"
         file = name + self.platform.suffix
+        units = sorted(path for path in sources if path.endswith(".c"))
+        command = [
+            *self.command,
+            *COMPILER_FLAGS,
+            *warnings,
+            *("-isystem", str(headers)),
+            *units,
+            *("-o", file),
+            *self.linker_flags,
+        ]
         with TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as name_of_folder:
             folder = Path(name_of_folder).absolute()
-            for path, data in {"empty.c": b"", **sources}.items():
+            (folder / "empty.c").touch()
+            for path, data in sources.items():
                 (folder / path).write_bytes(data)
-            units = sorted(path for path in sources if path.endswith(".c"))
-            command = [
-                *self.command, *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
-                *units, "-o", file, *self.linker_flags,
-            ]  # fmt: skip
+            # What the runtime's compiler says is not about the sources.
             for step in filter(None, (self.runtime, command)):
                 result = subprocess.run(
                     step, cwd=folder, capture_output=True, text=True, check=False
@@ -165,12 +179,15 @@ def cross_compiler(platform: Platform) -> Compiler:
     """Zig's C compiler for any platform, from PyPI; raises BuildError when it is not installed."""
     if importlib.util.find_spec("ziglang") is None:
         raise BuildError("no cross-compiler: pip install 'rti-cosim[cross]'")
-    zig, target = (sys.executable, "-m", "ziglang"), ("-target", platform.target)
-    # `zig cc` compiles the C library of Windows file by file, and has no option for more at once.
-    runtime = ("build-lib", *target, "-dynamic", "-lc", "-OReleaseFast", "-fstrip", "empty.c")
-    jobs = f"-j{2 * (os.cpu_count() or 1)}"
-    first = (*zig, *runtime, jobs) if platform.suffix == ".dll" else ()
-    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], first)
+    zig = (sys.executable, "-m", "ziglang")
+    target = ("-target", platform.target)
+    runtime: tuple[str, ...] = ()
+    if platform.suffix == ".dll":
+        # `zig cc` compiles the C library of Windows file by file; `build-lib` several at once.
+        options = ("-dynamic", "-lc", "-OReleaseFast", "-fstrip")
+        jobs = f"-j{2 * (os.cpu_count() or 1)}"
+        runtime = (*zig, "build-lib", *target, *options, "empty.c", jobs)
+    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], runtime)
 
 
 def compilers(every_platform: bool) -> list[Compiler]:
@@ -190,36 +207,60 @@ def build_fmu(
     files: Mapping[str, bytes] | None = None,
     warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
-    """Compile C sources and write them with their model description as the FMU `target`.
+    """Compile C sources and write them with their model description as an FMU.
 
-    `sources` are the files of the folder ``sources/`` by name; every ``*.c`` is compiled, as C99,
-    against fmpy's FMI headers. `description` is the text of modelDescription.xml, FMI 2.0 or 3.0;
-    its interfaces must name one modelIdentifier. The binary is for the platform at hand, made by
-    the local compiler, or, with `every_platform`, one for each of `PLATFORMS`, made by the extra
-    ``cross``. `files` are further members by their path in the archive, `warnings` what the
-    compiler warns of, by its options. With the same compiler the bytes repeat. Raises BuildError
-    where there is no compiler, it complains, or the description names no model.
+    With the same compiler the bytes repeat.
+
+    Args:
+        target: path of the FMU.
+        sources: files of the folder ``sources/`` by name; every ``*.c`` is compiled, as C99,
+            against fmpy's FMI headers.
+        description: text of modelDescription.xml, FMI 2.0 or 3.0; its interfaces must name one
+            modelIdentifier.
+        every_platform: build for each of `PLATFORMS`, by the extra ``cross``, and not for the
+            platform at hand alone, by the local compiler.
+        files: further members by their path in the archive.
+        warnings: compiler options that choose what it warns of.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        BuildError: if there is no compiler, it complains, or the description names no model.
     """
     path = Path(target)
     text = description.encode() if isinstance(description, str) else description
     version, identifier = _model(text)
     if not any(name.endswith(".c") for name in sources):
         raise BuildError(f"{path}: there is no C source (*.c) to build it from")
-    used = compilers(every_platform)
-    with ThreadPoolExecutor(len(used)) as pool:
-        built = pool.map(lambda each: each.library(sources, identifier, warnings), used)
-        libraries = dict(zip((each.platform for each in used), built, strict=True))
-    macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]
+    libraries = _libraries(compilers(every_platform), sources, identifier, warnings)
     members = {**(files or {}), "modelDescription.xml": text}
-    members |= {f"sources/{name}": data for name, data in sources.items()}
+    for name, data in sources.items():
+        members[f"sources/{name}"] = data
+    macos = [data for platform, data in libraries.items() if platform.suffix == ".dylib"]
     for platform, library in libraries.items():
         folder = platform.folder(version)
+        name = f"binaries/{folder}/{identifier}{platform.suffix}"
         # FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both
         # are built, lies a universal binary.
         universal = folder == "darwin64" and len(macos) > 1
-        name = f"binaries/{folder}/{identifier}{platform.suffix}"
         members[name] = universal_binary(macos) if universal else library
     return write_archive(members, path)
+
+
+def _libraries(
+    compilers: Sequence[Compiler],
+    sources: Mapping[str, bytes],
+    identifier: str,
+    warnings: tuple[str, ...],
+) -> dict[Platform, bytes]:
+    """The shared library of each platform, all compiled at once."""
+    with ThreadPoolExecutor(len(compilers)) as pool:
+        running = {
+            compiler.platform: pool.submit(compiler.library, sources, identifier, warnings)
+            for compiler in compilers
+        }
+        return {platform: future.result() for platform, future in running.items()}
 
 
 def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
@@ -288,18 +329,24 @@ def _sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
         first_parameter=first_output + kinds.count(Kind.OUTPUT),
         sampling_time=float(system.step_size),
     )
-    own = files_of("sampled_sources") | {"system.h": header.encode()}
-    if version == 3:  # its functions for scalars, and the adapter for the model's arrays
-        elements = dict.fromkeys(range(len(kinds)), (1, 0))
-        for array in system.arrays.values():
-            places = [system.value_reference(variable.name) for variable in array]
-            for k, place in enumerate(places):
-                elements[place] = (0 if k else len(places), places[(k + 1) % len(places)])
-        own["arrays.h"] = render("arrays.h", model=system, elements=elements.values()).encode()
-        last = b'#include "snapshot.h"\n'
-        scalars = (SOURCES / "fmi3.c").read_bytes()
-        own["fmi3.c"] = scalars.replace(last, last + b'#include "arrays.h"\n')
-    return own
+    sources = files_of("sampled_sources")
+    sources["system.h"] = header.encode()
+    if version == 2:
+        return sources
+    # FMI 3.0 has its functions for scalars, and an adapter for the model's arrays.
+    elements = dict.fromkeys(range(len(kinds)), (1, 0))
+    for array in system.arrays.values():
+        references = [system.value_reference(variable.name) for variable in array]
+        # The first element stands for the array and has its size; each points to the next.
+        for k, reference in enumerate(references):
+            size = len(references) if k == 0 else 0
+            elements[reference] = (size, references[(k + 1) % len(references)])
+    adapter = render("arrays.h", model=system, elements=elements.values())
+    sources["arrays.h"] = adapter.encode()
+    last_include = b'#include "snapshot.h"\n'
+    scalars = (SOURCES / "fmi3.c").read_bytes()
+    sources["fmi3.c"] = scalars.replace(last_include, last_include + b'#include "arrays.h"\n')
+    return sources
 
 
 def build_model(
@@ -311,19 +358,31 @@ def build_model(
     files: Mapping[str, bytes] | None = None,
     warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
-    """Build the FMU `target` of a model, with a page of its variables.
+    """Build the FMU of a model, with a page of its variables; with the same compiler, equal bytes.
 
-    `files` are further members of the archive. As `build_fmu`, whose BuildError it raises; with the
-    same compiler the bytes repeat.
+    Args:
+        model: its table of variables and its sources.
+        target: path of the FMU.
+        version: major version of FMI.
+        every_platform: build for each of `PLATFORMS`, and not for the platform at hand alone.
+        files: further members by their path in the archive.
+        warnings: compiler options that choose what it warns of.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        BuildError: as `build_fmu`.
     """
     sources = sources_of(model, version)
     page = render("model.html", model=model, version=version)
     members = {
         "documentation/index.html": page.encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
-        **(terminals(model) if version == 3 else {}),
-        **(files or {}),
     }
+    if version == 3:
+        members |= terminals(model)
+    members |= files or {}
     text = model_description(version, token_of(model, version, sources), model)
     return build_fmu(
         target, sources, text, every_platform=every_platform, files=members, warnings=warnings
@@ -341,14 +400,22 @@ def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes])
 def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:
     """The variables of a sampled model, a function of inputs and parameters.
 
-    `signals` are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
-    parameters; every output depends on every input and parameter. Raises BuildError on names that
-    are taken twice, in FMI or in C.
+    Args:
+        signals: real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
+            parameters.
+
+    Returns:
+        The table: time, then the signals; every output depends on every input and parameter.
+
+    Raises:
+        BuildError: if two names are the same, in FMI or in C.
     """
-    time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
-    known = tuple(v.name for v in signals if v.settable)
-    table = (time, *(v if v.settable else replace(v, uses=known) for v in signals))
+    table = [Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")]
+    known = tuple(signal.name for signal in signals if signal.settable)
+    for signal in signals:
+        table.append(signal if signal.settable else replace(signal, uses=known))
     for names in ([v.name for v in table], [v.identifier for v in table]):
-        if twice := next((each for each in names if names.count(each) > 1), None):
-            raise BuildError(f"two variables are called '{twice}'")
-    return table
+        for name in names:
+            if names.count(name) > 1:
+                raise BuildError(f"two variables are called '{name}'")
+    return tuple(table)

@@ -50,15 +50,13 @@ def simulate(
         out_.announce(loaded.plant.fmu)
         recorder = None
         if record:
-            from cosim.recording import RerunRecorder, spare_pandas
+            from cosim.recording import RerunRecorder
 
             recorder = RerunRecorder(folder / "run.rrd")
         between = recorder.intermediate if recorder else None
         with cosim.FmuPlant(loaded, intermediate=between) as plant:
             law = cosim.build_controller(controller, loaded)
             compile_functions(law, steps)
-            if record:  # a plug-in's own use of pandas stays
-                spare_pandas()
             run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=out_.live)
             summary: dict[str, Any] = {
                 "version": version("rti-cosim"),

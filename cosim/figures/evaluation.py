@@ -13,8 +13,8 @@ from matplotlib.ticker import FormatStrFormatter
 from cosim.figures.style import (
     DASHED,
     REFERENCE,
-    Dots,
-    Look,
+    DotRow,
+    LineStyle,
     dot_rows,
     figure,
     palette,
@@ -43,11 +43,11 @@ def evaluation_figure(
     same seeds: the left panel then shows the regret (J − J*)/|J*| in %, paired over the seeds.
     The grey line joins the controllers that no other one beats in both cost and violation.
     """
-    looks = palette(list(controllers))
+    styles = palette(list(controllers))
     with figure(max(2.8, 0.27 * len(controllers) + 1.3)) as drawn:
         left, right = drawn.subplots(1, 2, width_ratios=(1.0, 1.05))
-        _rows(left, controllers, looks, optimal)
-        _pareto(right, controllers, looks)
+        _rows(left, controllers, styles, optimal)
+        _pareto(right, controllers, styles)
         drawn.suptitle(plain(title))
     return drawn
 
@@ -55,7 +55,7 @@ def evaluation_figure(
 def _rows(
     axes: Axes,
     controllers: Mapping[str, pd.DataFrame],
-    looks: Mapping[str, Look],
+    styles: Mapping[str, LineStyle],
     optimal: Array | None,
 ) -> None:
     rows = []
@@ -67,8 +67,8 @@ def _rows(
             values = 100 * regret_terms(values, optimal)
         ends = (scale * end for end in estimate.interval or ())
         finished = np.ones(len(values), dtype=bool)
-        rows.append(Dots(name, values, finished, scale * estimate.value, *ends))
-    values = dot_rows(axes, rows, looks)
+        rows.append(DotRow(name, values, finished, scale * estimate.value, *ends))
+    values = dot_rows(axes, rows, styles)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
         regret_axis(axes, "x", np.append(values, 0.0), FLOOR)
@@ -79,7 +79,9 @@ def _rows(
     axes.set_xlabel("J per sample, 95 % interval")
 
 
-def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[str, Look]) -> None:
+def _pareto(
+    axes: Axes, controllers: Mapping[str, pd.DataFrame], styles: Mapping[str, LineStyle]
+) -> None:
     means = {
         name: (float(np.mean(c.mean_violation)), float(np.mean(c.economic_cost)))
         for name, c in controllers.items()
@@ -94,7 +96,7 @@ def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[
         axes.plot(*np.array(front).T, color=REFERENCE, linewidth=0.9, linestyle=DASHED, label=text)
         axes.legend(loc="best")
     for name, costs in controllers.items():
-        color = looks[name].color
+        color = styles[name].color
         axes.plot(
             costs.mean_violation, costs.economic_cost, ".", color=color, ms=3, alpha=0.35, mew=0
         )

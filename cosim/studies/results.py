@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
-from cosim.figures.style import FORMATS, Dots, Look, palette, save_set
+from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
@@ -449,7 +449,7 @@ class StudyResults(Shown):
         }
 
     @property
-    def _looks(self) -> dict[str, Look]:
+    def _styles(self) -> dict[str, LineStyle]:
         return palette(list(self.cases), self.scenarios)
 
     def _regret(self, scenario: str) -> Figure | None:
@@ -463,8 +463,8 @@ class StudyResults(Shown):
                 middle, low, high = (100 * row[f"{kind}{end}"] for end in ("", "_low", "_high"))
                 lost = self.of(case, scenario).status.str.startswith("diverged").to_numpy()
                 values = 100 * self.regrets(case, scenario)
-                rows.append(Dots(case, values, ~lost, middle, low, high))
-        return figures.regret_figure(rows, self._looks) if rows else None
+                rows.append(DotRow(case, values, ~lost, middle, low, high))
+        return figures.regret_figure(rows, self._styles) if rows else None
 
     def _curves(self, scenario: str) -> Figure | None:
         """None if no training was evaluated more than once."""
@@ -488,7 +488,7 @@ class StudyResults(Shown):
         chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
         level = 100 * statistics.regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
         levels = dict(zip(chosen, map(float, level), strict=True))
-        return figures.curves_figure(curves, levels, self._looks, relative=known)
+        return figures.curves_figure(curves, levels, self._styles, relative=known)
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, needed=["samples"])
@@ -515,7 +515,7 @@ class StudyResults(Shown):
         about, judged = self.about["operation"][scenario], self._judged(scenario)
         if judged.lives.samples.nunique() == 1:  # no course to draw
             return None
-        return figures.operation_figure(judged, about, self._looks, self.baselines)
+        return figures.operation_figure(judged, about, self._styles, self.baselines)
 
     def report(self) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""

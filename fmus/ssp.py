@@ -110,14 +110,18 @@ def _parameters(
     """Name, element and text of each start value."""
     types = {variable.name: variable.declaredType for variable in plant.modelVariables}
     parameters = []
-    for name, (stated, value) in starts.items():
+    for name, (kind, value) in starts.items():
         # Importers of FMI 2.0 set an enumeration through its number.
-        number = stated == "Enumeration" and plant.fmiVersion[0] == "2"
-        kind = "Integer" if number else stated
-        text = repr(float(value)) if kind in ("Real", "Float64", "Float32") else str(int(value))
-        if kind == "Boolean":
+        if kind == "Enumeration" and plant.fmiVersion[0] == "2":
+            kind = "Integer"  # noqa: PLW2901
+        if kind in ("Real", "Float64", "Float32"):
+            text = repr(float(value))
+        elif kind == "Boolean":
             text = "true" if value else "false"
         elif kind == "Enumeration":
-            text = next(item.name for item in types[name].items if item.value == text)
+            names = {item.value: item.name for item in types[name].items}
+            text = names[str(int(value))]
+        else:
+            text = str(int(value))
         parameters.append((name, kind, text))
     return parameters

@@ -170,13 +170,18 @@ def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) ->
 def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error: Array) -> Figure:
     """The paper's figure of a training: increments of θ by block, and the TD error.
 
-    `increments` maps a block's name to θ − θ₀ (K, entries) at `samples` (K,); `td_error` (K,) is
-    the root mean square over the preceding `TD_WINDOW` samples. Source: paper.tex, fig. nmpc_learn.
+    Source: paper.tex, fig. nmpc_learn.
+
+    Args:
+        samples: of the training, (K,).
+        increments: θ − θ₀ of each block by its name, (K, entries).
+        td_error: root mean square over the preceding `TD_WINDOW` samples, (K,).
     """
     moving = {name: values for name, values in increments.items() if np.any(values)}
-    styles = [
-        {"linestyle": line, "color": color} for line, color in product(("-", DASHED), ENTRIES)
-    ]
+    # Of the entries of a block, in turn: solid in every colour, then dashed.
+    styles = []
+    for line, color in product(("-", DASHED), ENTRIES):
+        styles.append({"linestyle": line, "color": color})
     columns = 4
     rows = -(-len(moving) // columns)
     with figure(1.3 * rows + 2.2) as drawn:
@@ -188,6 +193,7 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
             for k, entry in enumerate(values.T):
                 axes.plot(samples, entry, linewidth=0.8, **styles[k % len(styles)])
             axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
+            # Samples stand below the lowest panel of each column.
             axes.tick_params(labelbottom=i + columns >= len(moving))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
@@ -198,8 +204,9 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
         axes.set_title(title, loc="left", fontsize=8.0)
         most = max((values.shape[1] for values in moving.values()), default=0)
         if most:
-            shown = enumerate(styles[:most], 1)
-            handles = [Line2D([], [], linewidth=1.2, label=str(k), **look) for k, look in shown]
+            handles = []
+            for entry_number, style in enumerate(styles[:most], start=1):
+                handles.append(Line2D([], [], linewidth=1.2, label=str(entry_number), **style))
             title = "entry of its block, in the block's own unit"
             drawn.legend(handles=handles, loc="outside lower center", ncols=12, title=title)
     return drawn

@@ -129,8 +129,11 @@ def summarise(path: str | Path) -> dict[str, Any]:
     signals = {}
     for name, values in recording.signals.items():
         finite = values[np.isfinite(values)]
-        low, high = (float(finite.min()), float(finite.max())) if finite.size else (None, None)
-        signals[name] = {"unit": recording.units[name], "minimum": low, "maximum": high}
+        signals[name] = {
+            "unit": recording.units[name],
+            "minimum": float(finite.min()) if finite.size else None,
+            "maximum": float(finite.max()) if finite.size else None,
+        }
     return {
         "properties": recording.properties,
         "samples": len(recording.samples),
@@ -175,8 +178,9 @@ def _rows(batches: list[pa.RecordBatch]) -> pa.Table:
 def _values(rows: pa.Table, signals: int) -> list[NDArray[np.float64]]:
     """For each signal of a bundle its values, (K,) or (K, N)."""
     flat = pc.list_flatten(rows[_SCALARS]).to_numpy()
-    parts = np.ascontiguousarray(flat.reshape(len(rows), signals, -1).swapaxes(0, 1))
-    return [part[:, 0] if part.shape[1] == 1 else part for part in parts]
+    # A row has the numbers of the first signal, then those of the next.
+    by_signal = np.ascontiguousarray(flat.reshape(len(rows), signals, -1).swapaxes(0, 1))
+    return [values[:, 0] if values.shape[1] == 1 else values for values in by_signal]
 
 
 def _time(rows: pa.Table) -> NDArray[np.float64]:

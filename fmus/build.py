@@ -63,10 +63,19 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_archive(files: Mapping[str, bytes], target: Path) -> Path:
-    """Write `files`, by their path in the archive, to `target`, whole or not at all."""
+    """Write a ZIP archive, whole or not at all; the same files give the same bytes.
+
+    Args:
+        files: content by the path in the archive.
+        target: path of the archive.
+
+    Returns:
+        The path.
+    """
     with replacing(target) as partial, zipfile.ZipFile(partial, "x") as container:
         for name in sorted(files):
             entry = zipfile.ZipInfo(name, _DATE)
+            # As on Unix, a file that all may read, whatever the platform.
             entry.create_system = 3
             entry.external_attr = 0o100644 << 16
             container.writestr(entry, files[name])
@@ -195,7 +204,9 @@ def compilers(every_platform: bool) -> list[Compiler]:
 
     Raises BuildError where it is not installed.
     """
-    return [cross_compiler(p) for p in PLATFORMS] if every_platform else [local_compiler()]
+    if every_platform:
+        return [cross_compiler(platform) for platform in PLATFORMS]
+    return [local_compiler()]
 
 
 def build_fmu(
@@ -264,9 +275,19 @@ def _libraries(
 
 
 def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
-    """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into the FMU `target`.
+    """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into an FMU.
 
-    As `build_fmu`; raises OSError where there is no model description.
+    Args:
+        folder: where these files lie.
+        target: path of the FMU.
+        every_platform: build for each of `PLATFORMS`, and not for the platform at hand alone.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        OSError: if there is no model description.
+        BuildError: as `build_fmu`.
     """
     text = (Path(folder) / "modelDescription.xml").read_bytes()
     sources = {path.name: path.read_bytes() for path in Path(folder).glob("*.[ch]")}
@@ -308,10 +329,20 @@ def files_of(folder: str) -> dict[str, bytes]:
 
 
 def sources_of(model: FmuModel, version: FmiVersion) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own."""
-    paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
-    paths.append(PACKAGE / "plant_sources" / "derivatives.h")
-    files = {path.name: path.read_bytes() for path in paths}
+    """The files of the folder `sources/` of an FMU.
+
+    Args:
+        model: its own sources replace those that serve any model.
+        version: major version of FMI.
+
+    Returns:
+        Content by file name.
+    """
+    files = {}
+    for name in (*_FACES, f"fmi{version}.c"):
+        files[name] = (SOURCES / name).read_bytes()
+    # Without derivatives, unless the model has some of its own.
+    files["derivatives.h"] = (PACKAGE / "plant_sources" / "derivatives.h").read_bytes()
     if model.sampled:
         files |= _sampled_sources(model, version)
     files |= model.sources
@@ -390,9 +421,15 @@ def build_model(
 
 
 def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
-    """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model."""
+    """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model.
+
+    Args:
+        model: its description counts.
+        version: major version of FMI.
+        sources: content by file name; generated files, which hold the token, do not count.
+    """
     digest = hashlib.sha256(model_description(version, "", model).encode())
-    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):  # they are generated
+    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):
         digest.update(name.encode() + b"\0" + sources[name])
     return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
 

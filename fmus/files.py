@@ -60,7 +60,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def publish(temporary: Path, path: Path) -> None:
-    """Rename a complete file into place, synchronised; raises OSError, as `check_target` too."""
+    """Rename a complete file into place, synchronised with the disk.
+
+    Args:
+        temporary: the file, in the same folder.
+        path: its name from now on.
+
+    Raises:
+        OSError: if that is not possible; as `check_target`, too.
+    """
     check_target(path)
     with temporary.open("rb+") as stream:
         os.fsync(stream.fileno())
@@ -68,7 +76,15 @@ def publish(temporary: Path, path: Path) -> None:
 
 
 def write_atomically(path: str | Path, data: bytes | str) -> Path:
-    """Write a file as `replacing` does; text is encoded as UTF-8."""
+    """Write a file as `replacing` does.
+
+    Args:
+        path: of the file.
+        data: its content; text is encoded as UTF-8.
+
+    Returns:
+        The path.
+    """
     with replacing(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
     return Path(path)

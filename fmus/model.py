@@ -231,7 +231,12 @@ class FmuModel:
 
 @cache
 def closure(name: str, model: FmuModel) -> frozenset[str]:
-    """All variables that calculated variable `name` depends on, states not resolved further."""
+    """All variables that a calculated variable depends on, states not resolved further.
+
+    Args:
+        name: of the variable.
+        model: the table that it is in.
+    """
     names: set[str] = set()
     for used in model.by_name[name].uses:
         names.add(used)
@@ -241,19 +246,30 @@ def closure(name: str, model: FmuModel) -> frozenset[str]:
 
 
 def continuous_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
-    """States and inputs that `name` depends on during the simulation, in table order."""
+    """States and inputs that a variable depends on during the simulation, in table order.
+
+    Args:
+        name: of the variable.
+        model: the table that it is in.
+    """
     if model.by_name[name].kind is Kind.STATE:
         return (name,)
     known = closure(name, model)
-    return tuple(n for n in model.names(Kind.STATE, Kind.INPUT) if n in known)
+    return tuple(other for other in model.names(Kind.STATE, Kind.INPUT) if other in known)
 
 
 def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
-    """Parameters and inputs that `name` depends on at initialisation, in table order."""
-    names = set(closure(name, model))
-    states = [known for known in names if model.by_name[known].kind is Kind.STATE]
-    for state in states:  # at the start each depends on its start parameter
-        names |= closure(state, model)
+    """Parameters and inputs that a variable depends on at initialisation, in table order.
+
+    Args:
+        name: of the variable.
+        model: the table that it is in.
+    """
+    direct = closure(name, model)
+    names = set(direct)
+    for known in direct:
+        if model.by_name[known].kind is Kind.STATE:  # which depends on its start parameter
+            names |= closure(known, model)
     return tuple(v.name for v in model.variables if v.name in names and v.settable)
 
 
@@ -294,8 +310,12 @@ def _xml(text: str) -> str:
 
 
 def _attributes(values: Attributes) -> str:
-    pairs = ((key, value) for key, value in values.items() if value is not None)
-    return "".join(f' {key}="{_xml(str(value))}"' for key, value in pairs)
+    """XML attributes, but for those that are None."""
+    text = ""
+    for key, value in values.items():
+        if value is not None:
+            text += f' {key}="{_xml(str(value))}"'
+    return text
 
 
 def _number(value: float) -> str:
@@ -345,9 +365,16 @@ def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
 
 
 def terminals(model: FmuModel, icon: bool = False) -> dict[str, bytes]:
-    """FMI 3.0's terminalsAndIcons.xml by its path, if the `model` has a terminal; with an icon."""
+    """FMI 3.0's terminalsAndIcons.xml by its path, if the model has a terminal.
+
+    Args:
+        model: the model.
+        icon: whether the archive holds an icon, too.
+    """
+    if not model.terminal:
+        return {}
     text = render("terminalsAndIcons.xml", model=model, icon=icon)
-    return {"terminalsAndIcons/terminalsAndIcons.xml": text.encode()} if model.terminal else {}
+    return {"terminalsAndIcons/terminalsAndIcons.xml": text.encode()}
 
 
 def build_description(version: FmiVersion, model: FmuModel) -> str:
@@ -452,12 +479,15 @@ def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, lis
 
 
 def c_header(token: str, model: FmuModel) -> str:
-    """The header's text: value references, types, starts and ranges, and the model's `token`.
+    """The text of variables.h: value references, types, starts, ranges, and the model's token.
 
-    The C of a sampled model checks every variable against a range.
+    The C of a sampled model checks every variable against a range. With the header FMI's functions
+    are called ``identifier_fmi2…`` and so on, so that several models link into one program; whoever
+    builds a library defines FMI2_ or FMI3_OVERRIDE_FUNCTION_PREFIX.
 
-    With it FMI's functions are called ``identifier_fmi2…`` and so on, so that several models link
-    into one program; whoever builds a library defines FMI2_ or FMI3_OVERRIDE_FUNCTION_PREFIX.
+    Args:
+        token: GUID or instantiation token.
+        model: the model.
     """
     names = "\n".join(variable.name for variable in model.variables)
     return render(
@@ -465,6 +495,7 @@ def c_header(token: str, model: FmuModel) -> str:
         token=token,
         model=model,
         origin=model.origin or f"the table of {model.name}",
+        # A serialised state of another table is refused.
         layout=hashlib.sha256(names.encode()).hexdigest()[:16],
         types=list(Type.__members__),
         kinds=list(Kind.__members__),
@@ -479,4 +510,5 @@ def _numbers(most: float, variable: Variable) -> tuple[float, ...]:
     if variable.type in (Type.SEED, Type.SEED_HIGH):
         low, high = 0.0, 2.0**32 - 1
     nominal = 1.0 if variable.nominal is None else variable.nominal
+    # Nothing and −0.0 are written as 0.0.
     return tuple(float(number or 0.0) for number in (variable.start, low, high, nominal))

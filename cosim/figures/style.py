@@ -61,15 +61,29 @@ class StyledFigure(Figure):
 
 @contextmanager
 def figure(height: float, width: float = WIDTH) -> Iterator[Figure]:
-    """A figure of the house style, in inches, without touching the user's own settings."""
+    """A figure of the house style, without touching the user's own settings.
+
+    Args:
+        height: in inches.
+        width: in inches.
+    """
     with mpl.rc_context(fname=_STYLE):
         yield StyledFigure(figsize=(width, height), layout="constrained")
 
 
 def save(drawn: Figure, path: str | Path) -> Path:
-    """Write a figure as PNG (200 dpi) or SVG, by the path's suffix; same figure, same bytes.
+    """Write a figure as PNG (200 dpi) or SVG; the same figure gives the same bytes.
 
-    Raises FigureError on another suffix, OSError where the file cannot be written.
+    Args:
+        drawn: the figure.
+        path: of the file; its suffix says the format.
+
+    Returns:
+        The path.
+
+    Raises:
+        FigureError: on another suffix.
+        OSError: if the file cannot be written.
     """
     kind = Path(path).suffix.removeprefix(".")
     if kind not in ("png", "svg"):
@@ -186,10 +200,17 @@ def symbol(name: str) -> str:
 
 
 def label(name: str, unit: str) -> str:
-    """Axis label `name [unit]`; `X2` prints with its digits as a subscript."""
+    """Axis label `name [unit]`; `X2` prints with its digits as a subscript.
+
+    Args:
+        name: of the signal.
+        unit: as FMI writes it; `1` and nothing are not shown.
+    """
     head = name.rstrip("0123456789")
     digits = name[len(head) :]
-    text = f"${head}_{{{digits}}}$" if digits and head.isalpha() else plain(name.replace("_", " "))
+    text = plain(name.replace("_", " "))
+    if digits and head.isalpha():
+        text = f"${head}_{{{digits}}}$"
     shown = plain({"degC": "°C", "1": ""}.get(unit, unit))
     return f"{text} [{shown}]" if shown else text
 
@@ -311,7 +332,13 @@ def cost_lines(
 
 
 def samples_axis(axes: Axes, end: float, text: str = "") -> None:
-    """Let an abscissa show samples from 0 to `end`."""
+    """Let an abscissa show samples from 0 on.
+
+    Args:
+        axes: what is scaled.
+        end: the last sample.
+        text: label of the axis.
+    """
     axes.set_xlim(0.0, end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel(text)
@@ -326,15 +353,23 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
     """
     drawn.draw_without_rendering()
     for axes, names in labels:
-        # The ends as shares of the axes' height, from the highest to the lowest.
-        low, high = (axes.transData.transform((0, y))[1] for y in axes.get_ylim())
-        ends = np.array([axes.transData.transform((0, name.y))[1] for name in names])
-        wanted = np.clip((ends - low) / (high - low), 0.0, 1.0)
-        order = np.argsort(-wanted, kind="stable")
+        if not names:
+            continue
+        ends = np.array([_height(axes, name.y) for name in names])
+        wanted = np.clip(ends, 0.0, 1.0)
+        highest_first = np.argsort(-wanted, kind="stable")
         points = axes.get_window_extent().height * 72 / axes.figure.dpi
-        placed = spread(wanted[order], 1.25 * END_SIZE / points) if names else ()
-        for position, index in zip(placed, order, strict=True):
+        placed = spread(wanted[highest_first], gap=1.25 * END_SIZE / points)
+        for position, index in zip(placed, highest_first, strict=True):
             _label_end(axes, names[index], float(wanted[index]), float(position))
+
+
+def _height(axes: Axes, y: float) -> float:
+    """Where an ordinate lies on the page, as a share of the axes' height."""
+    to_page = axes.transData.transform
+    low, high = axes.get_ylim()
+    bottom, top = to_page((0, low))[1], to_page((0, high))[1]
+    return float((to_page((0, y))[1] - bottom) / (top - bottom))
 
 
 def _label_end(axes: Axes, name: EndLabel, end: float, position: float) -> None:
@@ -363,10 +398,17 @@ def _label_end(axes: Axes, name: EndLabel, end: float, position: float) -> None:
 
 
 def spread(positions: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
-    """Descending positions (K,) in [0, 1], moved as little as need be to be `gap` apart.
+    """Move positions apart, as little as need be.
 
-    They minimise the sum of the squared moves, within [0, 1]: an isotonic regression of
+    The sum of the squared moves is least, within [0, 1]: an isotonic regression of
     `positions[i] + i·gap`, clipped. Where K gaps do not fit, the lowest is at 0.
+
+    Args:
+        positions: (K,) in [0, 1], descending.
+        gap: least distance of two.
+
+    Returns:
+        The positions, (K,), at least `gap` apart.
     """
     from scipy.optimize import isotonic_regression  # noqa: PLC0415 - a third of a second
 

@@ -191,7 +191,12 @@ class RerunRecorder:
             stream.send([channel], rows, values)
 
     def intermediate(self, time: float, states: Array) -> None:
-        """Take the states (n,) at a time [s] within a sample."""
+        """Take the states within a sample.
+
+        Args:
+            time: in s.
+            states: (n,).
+        """
         self._within.append((time, *states.tolist()))
 
     def close(self) -> None:
@@ -626,7 +631,12 @@ def _is_drawable(character: str) -> bool:
 
 
 def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> list[rr.TimeColumn]:
-    """Index columns of K rows: sample numbers and, where there is one, the time in s to 1 ns."""
+    """Index columns of K rows.
+
+    Args:
+        samples: their numbers, (K,).
+        time: in s, (K,), recorded to 1 ns; None where there is none.
+    """
     columns = [rr.TimeColumn(SAMPLE, sequence=np.asarray(samples, dtype=np.int64))]
     if time is not None:
         nanoseconds = np.rint(time * 1e9).astype("timedelta64[ns]")
@@ -671,7 +681,12 @@ def view(
 
 
 def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
-    """The views with a paused time panel on a timeline, and no other panels in the way."""
+    """The layout of a recording, with no other panels in the way.
+
+    Args:
+        root: the views.
+        timeline: that of the time panel, which is paused.
+    """
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),

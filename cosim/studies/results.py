@@ -521,8 +521,10 @@ class StudyResults(Shown):
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
         page = self._page(self.draw(self.folder / report.FOLDER))
 
-        def picture(name: str) -> dict[str, str]:
-            return report.image(self.folder / report.FOLDER / f"{name}.svg")
+        def picture(name: str) -> dict[str, str] | None:
+            path = self.folder / report.FOLDER / f"{name}.svg"
+            # Those of a stored study's single runs are there once `cosim results draw` drew them.
+            return report.image(path) if path.is_file() else None
 
         for name in (report.TABLES, report.PAGE):
             write_atomically(self.folder / name, report.rendered(name, **page, picture=picture))
@@ -541,11 +543,8 @@ class StudyResults(Shown):
             table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE)
             sections.append({"title": "All scenarios", "table": table})
         sections += [{"title": title, "table": table} for title, *table in self.further()]
-        # Those of a stored study are there once `cosim results draw` has drawn them.
-        folder = self.folder / report.FOLDER
-        pictures = [name for name in self.about["pictures"] if (folder / f"{name}.svg").is_file()]
-        if pictures:
-            sections.append({"title": "Sample by sample", "figures": pictures})
+        if self.about["pictures"]:
+            sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
         table = report.texts(self.cases.values(), report.CASES)
         sections.append({"title": "Cases", "table": table})
         made = self.about["made_with"]

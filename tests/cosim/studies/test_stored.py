@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from cosim import StudyResults
 from cosim.cli.main import app
 from cosim.studies.run import read_table
 from cosim.studies.stored import stored_studies
@@ -93,6 +94,16 @@ def test_a_stored_study_s_figures_are_drawn_from_its_tables(mini, tmp_path):
     assert {"figures/overlay-paper-loop.svg", "figures/regret-paper.svg"} <= set(linked)
     drawn = [path.relative_to(folder / "mini").as_posix() for path in folder.rglob("*.svg")]
     assert sorted(drawn) == sorted(linked)
+
+
+def test_a_report_of_a_stored_study_without_its_figures_says_so(mini, tmp_path):
+    folder = tmp_path / "mini"
+    shutil.copytree(mini / "mini", folder)
+    before = (folder / "report.md").read_text()
+    page = StudyResults.load(folder).report().read_text("utf-8")
+    assert "overlay-paper-loop is not drawn" in page
+    assert 'alt="regret-paper"' in page
+    assert (folder / "report.md").read_text() == before
 
 
 def test_update_stores_tables_report_and_readme(mini):

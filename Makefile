@@ -19,13 +19,19 @@ check: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m mkdocs build --strict --site-dir build/site
+	$(MAKE) docs
 	$(PYTEST) -m slow
 	$(BIN)/cosim results check
 	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo
 
+# The figures of the stored studies, which the site shows; drawn anew where a table is newer.
+build/figures: $(wildcard results/*.toml results/*/*.csv cosim/figures/* cosim/studies/*.py) | $(VENV)/installed-dev
+	$(BIN)/cosim results draw
+	mkdir -p build
+	touch $@
+
 # The documentation as a site, in build/site; any warning is an error.
-docs: $(VENV)/installed-dev
+docs: build/figures
 	$(BIN)/python -m mkdocs build --strict --site-dir build/site
 
 # What takes many minutes a test and is run by hand.

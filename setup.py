@@ -8,8 +8,8 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-# Recordings are large and are made anew by one command; `.work` is what unfinished runs left.
-LEFT_OUT = shutil.ignore_patterns(".work", "*.rrd", "report.html")
+# Recordings and figures are made anew by one command; `.work` is what unfinished runs left.
+LEFT_OUT = shutil.ignore_patterns(".work", "figures", "*.rrd", "report.html")
 
 
 class BuildWithResults(build_py):

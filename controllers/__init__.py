@@ -1,6 +1,8 @@
 """NMPC as function approximator: parametric OCP, one QP per sample, its sensitivities."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import lazy_loader
 
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
@@ -29,11 +31,5 @@ __all__ = [
     "compile_functions",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name != "OptimalPolicy":
-        raise AttributeError(f"module 'controllers' has no attribute '{name}'")
-    # On first use: a controller must not pay for the import of SciPy.
-    from controllers.optimum import OptimalPolicy  # noqa: PLC0415
-
-    return OptimalPolicy
+# Imported on first use: a controller must not pay for the import of SciPy.
+__getattr__, _, _ = lazy_loader.attach(__name__, submod_attrs={"optimum": ["OptimalPolicy"]})

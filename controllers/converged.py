@@ -15,7 +15,6 @@ from controllers.qp import NOT_CONVEX, QpBackend
 from controllers.rti import RtiNmpc
 from controllers.rti.nmpc import RtiSolution
 from controllers.theta import Parameters
-from cosim.validation import known_keywords
 
 
 class ConvergedNmpc(RtiNmpc):
@@ -32,7 +31,6 @@ class ConvergedNmpc(RtiNmpc):
     memoryless = False
     """A feedback depends on earlier ones: it starts its SQP where the last one ended."""
 
-    @known_keywords
     def __init__(
         self,
         problem: Problem,

@@ -1,13 +1,13 @@
 """Co-simulation of an FMU plant with a controller: scenarios, closed loop, records, results."""
 
 import sys
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import lazy_loader
+
 if TYPE_CHECKING:
-    from controllers.theta import Parameters as Parameters
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
     from cosim.plant import FmuPlant as FmuPlant
@@ -18,30 +18,29 @@ if TYPE_CHECKING:
     from cosim.studies.plan import Study as Study
     from cosim.studies.results import StudyResults as StudyResults
     from cosim.studies.results import study as study
+    from cosim.training import Parameters as Parameters
+    from cosim.training import Training as Training
+    from cosim.training import train as train
     from cosim.trajectory import Trajectory as Trajectory
-    from learning.training import Training as Training
-    from learning.training import train as train
 
     __version__: str
 
 # Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
-_HOMES = {
-    "Decision": "cosim.protocols",
-    "Evaluation": "cosim.evaluation",
-    "FmuPlant": "cosim.plant",
-    "Scenario": "cosim.scenario",
-    "Study": "cosim.studies.plan",
-    "StudyResults": "cosim.studies.results",
-    "Parameters": "controllers.theta",
-    "Training": "learning.training",
-    "Trajectory": "cosim.trajectory",
-    "build_controller": "cosim.plugins",
-    "evaluate": "cosim.evaluation",
-    "study": "cosim.studies.results",
-    "simulate": "cosim.simulation",
-    "train": "learning.training",
-}
-__all__ = list(_HOMES)
+_attribute, _names, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "evaluation": ["Evaluation", "evaluate"],
+        "plant": ["FmuPlant"],
+        "plugins": ["build_controller"],
+        "protocols": ["Decision"],
+        "scenario": ["Scenario"],
+        "simulation": ["simulate"],
+        "studies.plan": ["Study"],
+        "studies.results": ["StudyResults", "study"],
+        "training": ["Parameters", "Training", "train"],
+        "trajectory": ["Trajectory"],
+    },
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -49,13 +48,11 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version  # noqa: PLC0415
 
         return version("rti-cosim")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'cosim' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
+    return _attribute(name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES, "__version__"})
+    return sorted({*globals(), *_names(), "__version__"})
 
 
 def _refuse_shadows() -> None:

@@ -2,23 +2,30 @@
 
 from typing import Any
 
+from fmus.errors import CosimError
 
-class CosimError(Exception):
-    """Base of every error that the four packages raise on bad input or a failed run.
-
-    Its text is one line, whatever a user's name or value in it holds.
-    """
-
-    def __str__(self) -> str:
-        return " ".join(super().__str__().splitlines())
+__all__ = [
+    "CapabilityError",
+    "ComparisonError",
+    "ControllerLookupError",
+    "CosimError",
+    "CosimWarning",
+    "EvaluationError",
+    "FailedRunsError",
+    "FigureError",
+    "FmuWarning",
+    "PlantError",
+    "RecordingError",
+    "ResultsError",
+    "RunEndedError",
+    "ScenarioError",
+    "StudyError",
+    "TrajectoryError",
+]
 
 
 class CosimWarning(UserWarning):
     """Base of every warning that the four packages give; its message is one line for the user."""
-
-
-class ArgumentError(CosimError, TypeError):
-    """A function was called with a keyword that it does not have."""
 
 
 class ScenarioError(CosimError):

@@ -26,7 +26,7 @@ from cosim.protocols import Array, Decision
 from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, reporting, simulate
-from cosim.validation import instead, known_keywords, whole_number
+from cosim.validation import instead, whole_number
 from cosim.workers import Conditions, Failure, done
 
 if TYPE_CHECKING:
@@ -50,7 +50,6 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-@known_keywords
 def evaluate(
     scenario: Scenario | str | Path,
     controllers: Mapping[str, Factory | str] | Sequence[str],

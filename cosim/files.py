@@ -1,12 +1,10 @@
-"""Files: written whole or not at all, read with one message per error, cached, temporary."""
+"""Files: read with one message per error, cached, temporary; `fmus.files` writes them."""
 
 from __future__ import annotations
 
 import atexit
-import errno
 import json
 import os
-import secrets
 import shutil
 import signal
 import stat
@@ -14,76 +12,38 @@ import tempfile
 import threading
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import platformdirs
 
+from fmus.files import check_target, protect, publish, replacing, write_atomically
+
 if TYPE_CHECKING:
     import filelock
     from numpy.typing import NDArray
+
+__all__ = [
+    "CACHE_VARIABLE",
+    "cache_folder",
+    "check_target",
+    "lock",
+    "protect",
+    "publish",
+    "read_arrays",
+    "read_json",
+    "read_toml",
+    "replacing",
+    "temporary_folder",
+    "write_atomically",
+]
 
 # NumPy and filelock are imported where they are needed: `cosim --help` has no use for them.
 
 STAGED = ".cosim-staged-"
 """Begin of the names of folders in which the files of a run wait for its end."""
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
-_inputs: set[tuple[int, int]] = set()
-
-
-def protect(paths: Iterable[str | Path]) -> None:
-    """Protect these files, the inputs of the command and no others, from all writers."""
-    _inputs.clear()
-    for path in paths:
-        with suppress(OSError, ValueError):
-            if stat.S_ISREG((status := Path(path).stat()).st_mode):
-                _inputs.add((status.st_dev, status.st_ino))
-
-
-def check_target(path: str | Path) -> Path:
-    """The path, where a file may be written there.
-
-    Raises FileExistsError where an input of this command, or anything but a regular file (a folder,
-    a device, a FIFO), has the name.
-    """
-    path = Path(path)
-    if path.exists():
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise FileExistsError(errno.EEXIST, "it is not a regular file", str(path))
-        if (status.st_dev, status.st_ino) in _inputs:
-            raise FileExistsError(errno.EEXIST, "it is an input of this command", str(path))
-    return path
-
-
-@contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` to write to; rename it into place after the block.
-
-    A reader never sees half a file, and an older file survives any failure. Raises what
-    `check_target` raises, and OSError, which names the file, where the folder cannot be written or
-    is full.
-    """
-    path = check_target(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
-    try:
-        yield temporary
-        publish(temporary, path)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno:
-            error.filename = str(path)
-        raise
-
-
-def publish(temporary: Path, path: Path) -> None:
-    """Rename a complete file into place, synchronised; raises OSError, as `check_target` too."""
-    check_target(path)
-    with temporary.open("rb+") as stream:
-        os.fsync(stream.fileno())
-    temporary.replace(path)
 
 
 @contextmanager
@@ -166,13 +126,6 @@ def without_signals() -> Iterator[None]:
             signal.signal(number, handler)
         for number in caught:
             signal.raise_signal(number)
-
-
-def write_atomically(path: str | Path, data: bytes | str) -> Path:
-    """Write a file as `replacing` does; text is encoded as UTF-8."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
-    return Path(path)
 
 
 def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from math import nan
-from threading import RLock
 from time import perf_counter
 from typing import Any
 
@@ -15,13 +14,15 @@ from cosim.errors import CosimError, PlantError, RunEndedError
 from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
 from cosim.scenario import Scenario
 from cosim.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
-from cosim.validation import known_keywords, whole_number
+from cosim.validation import whole_number
 
 MEASURED = (
     "states", "actions", "stage_cost", "disturbances", "value", "residual", "failed",
     "prepare_time", "feedback_time", "plant_time",
 )  # fmt: skip
 """Signals in a row of the loop's table, in order (`cosim.protocols.CompiledLoop`)."""
+REFRESH = 0.1
+"""Seconds between two drawings of a progress bar, at least."""
 PREDICTED = ("predicted_states", "predicted_actions")
 PART = 500
 """Samples of a part; of more than 10⁵ samples it is longer, since a recording indexes each."""
@@ -39,7 +40,6 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     return int(plant.generate_state(1, np.uint64)[0]), np.random.default_rng(exploration)
 
 
-@known_keywords
 def simulate(
     plant: Plant,
     controller: Controller,
@@ -356,24 +356,40 @@ def reporting(
 ) -> Iterator[Callable[..., None]]:
     """Yield the callback of an argument `progress`: itself, a bar, or a no-op.
 
-    True stands for a bar of `total` samples: `read` turns what the function is called with into
-    the number done and a remark.
+    Args:
+        progress: a callback, True for a bar on standard error, False for neither.
+        label: what the bar is called.
+        total: samples of the whole work.
+        read: turns what the callback is called with into the number done and a remark.
     """
     if callable(progress) or not progress:
         yield progress or (lambda *news: None)
         return
-    from tqdm.auto import tqdm  # noqa: PLC0415, only where a bar is drawn
+    from rich import progress as rich_progress  # noqa: PLC0415, only where a bar is drawn
+    from rich.console import Console  # noqa: PLC0415
 
-    # No thread that watches the bar, and no lock between processes: one process draws it.
-    tqdm.monitor_interval = 0
-    tqdm.set_lock(RLock())
-    form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{remaining}{postfix}]"
-    looks = {"bar_format": form, "unit_scale": True, "miniters": 1, "dynamic_ncols": True}
-    with tqdm(total=total, desc=label, **looks) as bar:
+    console = Console(stderr=True)
+    if console.is_jupyter:
+        # Text, as on a terminal: rich's own display there needs ipywidgets.
+        console = Console(stderr=True, force_jupyter=False, force_terminal=True)
+    columns = (
+        rich_progress.TextColumn("{task.description}"),
+        rich_progress.BarColumn(bar_width=20),
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TimeRemainingColumn(),
+        rich_progress.TextColumn("{task.fields[remark]}"),
+    )
+    # Drawn from here, not by a thread of its own, ten times a second at most.
+    with rich_progress.Progress(*columns, console=console, auto_refresh=False) as bar:
+        task = bar.add_task(label, total=total, remark="")
+        last_drawn = 0.0
 
         def update(*news: object) -> None:
+            nonlocal last_drawn
             done, remark = read(*news)
-            bar.set_postfix_str(remark, refresh=False)
-            bar.update(done - bar.n)
+            bar.update(task, completed=done, remark=remark)
+            if perf_counter() - last_drawn >= REFRESH:
+                last_drawn = perf_counter()
+                bar.refresh()
 
         yield update

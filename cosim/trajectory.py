@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -77,7 +76,6 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("violation", _violation),
     SignalKind("value", unit=COST),
     SignalKind("residual"),
-    SignalKind("explored", whole=True),
     SignalKind("failed", whole=True),
     SignalKind("prepare_time", unit="s", group="step_time", clock=True),
     SignalKind("feedback_time", unit="s", group="step_time", clock=True),
@@ -112,9 +110,9 @@ class Trajectory(Result):
     Signals, each (K,): `time` [s]; the scenario's states, actions and disturbances under their
     FMU names; `stage_cost` ℓ(x_k, u_k, d_k) without penalty; `penalty` and `violation` Σᵢ vᵢ of
     x_k at the true bounds; the controller's `value` and `residual` (NaN if it has none);
-    `explored` (0: a run is greedy) and `failed` (0 or 1). `status` has one word per sample,
-    `fallback` where the controller failed. `timing` holds wall-clock times [s] by name, (K,);
-    `final_state` is x_K; `seed` is the noise's. `signals` maps names to signals.
+    `failed` (0 or 1). `status` has one word per sample, `fallback` where the controller failed.
+    `timing` holds wall-clock times [s] by name, (K,); `final_state` is x_K; `seed` is the noise's.
+    `signals` maps names to signals.
     """
 
     scenario: Scenario
@@ -208,21 +206,23 @@ class Trajectory(Result):
     def summary(self) -> dict[str, Any]:
         """`means` of the run and its counts; the same for the same signals.
 
-        `failures` are samples under the fallback action; `explored` is 0; `statuses` samples by
-        status.
+        `failures` are samples under the fallback action; `statuses` samples by status.
         """
         return {
             "samples": len(self),
             **self.means(),
             "failures": int(np.sum(self["failed"])),
-            "explored": int(np.sum(self["explored"])),
             "statuses": dict(sorted(Counter(self.status).items())),
             "final_state": None if self.final_state is None else self.final_state.tolist(),
         }
 
     def timing_summary(self) -> dict[str, dict[str, float]]:
         """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
-        return {name: _quantiles(values) for name, values in self.timing.items()}
+        summary = {}
+        for name, seconds in self.timing.items():
+            quantiles = 1e6 * np.quantile(seconds, list(QUANTILES.values()))
+            summary[name] = dict(zip(QUANTILES, quantiles.tolist(), strict=True))
+        return summary
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
@@ -255,15 +255,6 @@ def _write(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]
     with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
         csv.writer(stream, lineterminator="\n").writerows(chain([header], rows))
     return Path(path)
-
-
-def _quantiles(seconds: Array) -> dict[str, float]:
-    # np.quantile would load numpy.ma, 3 % of a short run's processor time.
-    last, ordered = len(seconds) - 1, np.sort(seconds)
-    return {
-        key: 1e6 * float(np.interp(q * last % 1, (0, 1), ordered[[int(q * last), ceil(q * last)]]))
-        for key, q in QUANTILES.items()
-    }
 
 
 def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from difflib import get_close_matches
-from functools import wraps
-from inspect import signature
 from operator import index
-from typing import Any, ParamSpec, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from cosim.errors import ArgumentError
-
 Document = TypeVar("Document", bound=BaseModel)
-P = ParamSpec("P")
-R = TypeVar("R")
 
 # In place of pydantic's messages, whose words are not TOML's.
 _EXPECTED = {"tuple_type": "must be a list"} | dict.fromkeys(
@@ -56,19 +50,6 @@ def instead(word: str, known: Iterable[str]) -> str:
     """Text with the words that are known in place of an unknown one, the closest first."""
     known = list(known)
     return f"{suggestion(word, known)}; there are {', '.join(known)}"
-
-
-def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a function refuse an unknown keyword by ArgumentError, with the closest known one."""
-    known = signature(function).parameters
-
-    @wraps(function)
-    def checked(*args: P.args, **keywords: P.kwargs) -> R:
-        for name in keywords.keys() - known.keys():
-            raise ArgumentError(f"no such argument: '{name}'{suggestion(name, known)}")
-        return function(*args, **keywords)
-
-    return checked
 
 
 def _complaint(detail: dict[str, Any], model: type[BaseModel]) -> str:

@@ -6,24 +6,12 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosim.errors import CosimError
+from fmus.errors import BuildError, CheckError, FmuError
 
 __all__ = ["NAMES", "PLANTS", "BuildError", "CheckError", "FmuError", "path"]
 
 NAMES = ("evaporator", "evaporator_fmi3")
 PLANTS = ("reactor", "tanks")
-
-
-class FmuError(CosimError):
-    """Base of every error that `fmus` raises for a bad input or environment."""
-
-
-class BuildError(FmuError):
-    """No usable C compiler, or the compiler refused the sources."""
-
-
-class CheckError(FmuError):
-    """The file to check is missing or is not an FMU."""
 
 
 def path(name: str = "evaporator") -> Path:
@@ -81,25 +69,47 @@ UNIVERSAL, _MACH_O_64, _MACH_O_32 = 0xCAFEBABE, 0xFEEDFACF, 0xFEEDFACE
 
 
 def platforms_of(library: bytes) -> tuple[str, ...]:
-    """FMI 3.0's tuples of the platforms that can load `library`; empty if none can.
+    """FMI 3.0's tuples of the platforms that can load a shared library; empty if none can.
 
     Several for macOS' universal binaries. An architecture unknown here reads ``?``.
     """
     try:
         if library[:4] == b"\x7fELF":
-            order = "<" if library[5] == 1 else ">"
-            return (f"{_ELF.get(struct.unpack_from(order + 'H', library, 18)[0], '?')}-linux",)
+            return (_elf_platform(library),)
         if library[:2] == b"MZ":
-            start = struct.unpack_from("<I", library, 0x3C)[0]
-            if library[start : start + 4] == b"PE\0\0":
-                machine = struct.unpack_from("<H", library, start + 4)[0]
-                return (f"{_PE.get(machine, '?')}-windows",)
-        if struct.unpack_from("<I", library)[0] in (_MACH_O_64, _MACH_O_32):
-            return (f"{_MACH_O.get(struct.unpack_from('<I', library, 4)[0], '?')}-darwin",)
-        magic, count = struct.unpack_from(">II", library)
-        if magic == UNIVERSAL and count < 10:
-            codes = (struct.unpack_from(">I", library, 8 + 20 * i)[0] for i in range(count))
-            return tuple(f"{_MACH_O.get(code, '?')}-darwin" for code in codes)
-    except (struct.error, IndexError):
-        pass
-    return ()
+            return _pe_platform(library)
+        return _mach_o_platforms(library)
+    except (struct.error, IndexError):  # the file ends within its header
+        return ()
+
+
+def _elf_platform(library: bytes) -> str:
+    """Platform of an ELF file: e_machine, in the byte order that the sixth byte says."""
+    order = "<" if library[5] == 1 else ">"
+    (machine,) = struct.unpack_from(order + "H", library, 18)
+    return f"{_ELF.get(machine, '?')}-linux"
+
+
+def _pe_platform(library: bytes) -> tuple[str, ...]:
+    """Platform of a Windows file: Machine, after the signature to which the DOS header points."""
+    (start,) = struct.unpack_from("<I", library, 0x3C)
+    if library[start : start + 4] != b"PE\0\0":
+        return ()
+    (machine,) = struct.unpack_from("<H", library, start + 4)
+    return (f"{_PE.get(machine, '?')}-windows",)
+
+
+def _mach_o_platforms(library: bytes) -> tuple[str, ...]:
+    """Platforms of a Mach-O file by cputype, or of each slice of a universal binary."""
+    magic, cpu = struct.unpack_from("<II", library)
+    if magic in (_MACH_O_64, _MACH_O_32):
+        return (f"{_MACH_O.get(cpu, '?')}-darwin",)
+    magic, count = struct.unpack_from(">II", library)
+    # Java's class files have the same magic number, and a version of more than 40 as the count.
+    if magic != UNIVERSAL or count >= 10:
+        return ()
+    platforms = []
+    for position in range(count):
+        (cpu,) = struct.unpack_from(">I", library, 8 + 20 * position)
+        platforms.append(f"{_MACH_O.get(cpu, '?')}-darwin")
+    return tuple(platforms)

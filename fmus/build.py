@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.resources
 import importlib.util
 import os
 import shutil
@@ -16,12 +15,13 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
 import fmpy
 
-from cosim.files import replacing, temporary_folder
 from fmus import PLATFORMS, UNIVERSAL, BuildError, Platform, present
+from fmus.files import replacing
 from fmus.model import (
     FmiVersion,
     FmuModel,
@@ -63,10 +63,19 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_archive(files: Mapping[str, bytes], target: Path) -> Path:
-    """Write `files`, by their path in the archive, to `target`, whole or not at all."""
+    """Write a ZIP archive, whole or not at all; the same files give the same bytes.
+
+    Args:
+        files: content by the path in the archive.
+        target: path of the archive.
+
+    Returns:
+        The path.
+    """
     with replacing(target) as partial, zipfile.ZipFile(partial, "x") as container:
         for name in sorted(files):
             entry = zipfile.ZipInfo(name, _DATE)
+            # As on Unix, a file that all may read, whatever the platform.
             entry.create_system = 3
             entry.external_attr = 0o100644 << 16
             container.writestr(entry, files[name])
@@ -105,7 +114,7 @@ class Compiler:
     """A C compiler for one platform: the command that calls it and the flags of its linker.
 
     `runtime` is a command that compiles the platform's C library and `empty.c`, where that is to be
-    done first. Of its files those that our FMUs do not use come in where a symbol is missing.
+    done first.
     """
 
     platform: Platform
@@ -116,7 +125,8 @@ class Compiler:
     @property
     def version(self) -> str:
         """Its version, one line."""
-        with temporary_folder("cosim-") as folder:  # Zig leaves a file where it is called
+        # Zig leaves a file where it is called.
+        with TemporaryDirectory(prefix="cosim-") as folder:
             result = subprocess.run(
                 [*self.command, "--version"], cwd=folder, capture_output=True, text=True, check=True
             )
@@ -125,55 +135,44 @@ class Compiler:
     def library(
         self, sources: Mapping[str, bytes], name: str, warnings: tuple[str, ...] = WARNINGS
     ) -> bytes:
-        """Compile every ``*.c`` of `sources`, files by name, into one shared library.
+        """Compile every ``*.c`` of the sources into one shared library.
 
-        `name` is the library's, without suffix; the FMI headers are fmpy's. Returns its bytes.
-        Raises BuildError with the compiler's words on anything that it says; `warnings` chooses
-        what it warns of.
+        Args:
+            sources: files by name; the FMI headers are fmpy's.
+            name: the library's name, without suffix.
+            warnings: compiler options that choose what it warns of.
+
+        Returns:
+            The library's bytes.
+
+        Raises:
+            BuildError: with the compiler's words, on anything that it says.
         """
         headers = Path(fmpy.__file__).parent / "c-code"
         file = name + self.platform.suffix
-        with temporary_folder("cosim-") as folder:
-            for path, data in {"empty.c": b"", **sources}.items():
+        units = sorted(path for path in sources if path.endswith(".c"))
+        command = [
+            *self.command,
+            *COMPILER_FLAGS,
+            *warnings,
+            *("-isystem", str(headers)),
+            *units,
+            *("-o", file),
+            *self.linker_flags,
+        ]
+        with TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as name_of_folder:
+            folder = Path(name_of_folder).absolute()
+            (folder / "empty.c").touch()
+            for path, data in sources.items():
                 (folder / path).write_bytes(data)
-            units = sorted(path for path in sources if path.endswith(".c"))
-            command = [
-                *self.command, *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
-                *units, "-o", file, *self.linker_flags,
-            ]  # fmt: skip
-            attempts: list[dict[str, str]] = [{}]
-            if self.runtime and os.name != "nt":  # there, links need a privilege
-                attempts.insert(0, {"ZIG_LIB_DIR": str(_lean_library(folder / "zig"))})
-            for variables in attempts:
-                for step in filter(None, (self.runtime, command)):
-                    result = subprocess.run(
-                        step, cwd=folder, env=os.environ | variables, capture_output=True,
-                        text=True, check=False,
-                    )  # fmt: skip
-                if "undefined symbol" not in result.stderr:
-                    break
+            # What the runtime's compiler says is not about the sources.
+            for step in filter(None, (self.runtime, command)):
+                result = subprocess.run(
+                    step, cwd=folder, capture_output=True, text=True, check=False
+                )
             if result.returncode != 0 or result.stderr:
                 raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
             return (folder / file).read_bytes()
-
-
-def _lean_library(folder: Path) -> Path:
-    """Fill `folder` with links to Zig's library, less what our FMUs do not use of Windows' part.
-
-    Those are three quarters of its C files, and most of the time of a first build.
-    """
-    own = Path(str(importlib.resources.files("ziglang"))) / "lib"
-    mingw = own / "libc" / "mingw"
-    parts = {path.parent for path in mingw.glob("*/*.c")} - {mingw / "crt", mingw / "math"}
-    opened = (own, own / "libc", mingw, *parts)
-    for source in opened:
-        target = folder / source.relative_to(own)
-        target.mkdir()
-        for path in set(source.iterdir()).difference(opened):
-            used = source not in parts or path.suffix not in (".c", ".S")
-            used = used or path.name == "dllmain.c" or path.name.startswith("ucrt_")
-            (target / path.name).symlink_to(path if used else os.devnull)
-    return folder
 
 
 def local_compiler() -> Compiler:
@@ -189,12 +188,15 @@ def cross_compiler(platform: Platform) -> Compiler:
     """Zig's C compiler for any platform, from PyPI; raises BuildError when it is not installed."""
     if importlib.util.find_spec("ziglang") is None:
         raise BuildError("no cross-compiler: pip install 'rti-cosim[cross]'")
-    zig, target = (sys.executable, "-m", "ziglang"), ("-target", platform.target)
-    # `zig cc` compiles the C library of Windows file by file, and has no option for more at once.
-    runtime = ("build-lib", *target, "-dynamic", "-lc", "-OReleaseFast", "-fstrip", "empty.c")
-    jobs = f"-j{2 * (os.cpu_count() or 1)}"
-    first = (*zig, *runtime, jobs) if platform.suffix == ".dll" else ()
-    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], first)
+    zig = (sys.executable, "-m", "ziglang")
+    target = ("-target", platform.target)
+    runtime: tuple[str, ...] = ()
+    if platform.suffix == ".dll":
+        # `zig cc` compiles the C library of Windows file by file; `build-lib` several at once.
+        options = ("-dynamic", "-lc", "-OReleaseFast", "-fstrip")
+        jobs = f"-j{2 * (os.cpu_count() or 1)}"
+        runtime = (*zig, "build-lib", *target, *options, "empty.c", jobs)
+    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], runtime)
 
 
 def compilers(every_platform: bool) -> list[Compiler]:
@@ -202,7 +204,9 @@ def compilers(every_platform: bool) -> list[Compiler]:
 
     Raises BuildError where it is not installed.
     """
-    return [cross_compiler(p) for p in PLATFORMS] if every_platform else [local_compiler()]
+    if every_platform:
+        return [cross_compiler(platform) for platform in PLATFORMS]
+    return [local_compiler()]
 
 
 def build_fmu(
@@ -214,42 +218,76 @@ def build_fmu(
     files: Mapping[str, bytes] | None = None,
     warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
-    """Compile C sources and write them with their model description as the FMU `target`.
+    """Compile C sources and write them with their model description as an FMU.
 
-    `sources` are the files of the folder ``sources/`` by name; every ``*.c`` is compiled, as C99,
-    against fmpy's FMI headers. `description` is the text of modelDescription.xml, FMI 2.0 or 3.0;
-    its interfaces must name one modelIdentifier. The binary is for the platform at hand, made by
-    the local compiler, or, with `every_platform`, one for each of `PLATFORMS`, made by the extra
-    ``cross``. `files` are further members by their path in the archive, `warnings` what the
-    compiler warns of, by its options. With the same compiler the bytes repeat. Raises BuildError
-    where there is no compiler, it complains, or the description names no model.
+    With the same compiler the bytes repeat.
+
+    Args:
+        target: path of the FMU.
+        sources: files of the folder ``sources/`` by name; every ``*.c`` is compiled, as C99,
+            against fmpy's FMI headers.
+        description: text of modelDescription.xml, FMI 2.0 or 3.0; its interfaces must name one
+            modelIdentifier.
+        every_platform: build for each of `PLATFORMS`, by the extra ``cross``, and not for the
+            platform at hand alone, by the local compiler.
+        files: further members by their path in the archive.
+        warnings: compiler options that choose what it warns of.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        BuildError: if there is no compiler, it complains, or the description names no model.
     """
     path = Path(target)
     text = description.encode() if isinstance(description, str) else description
     version, identifier = _model(text)
     if not any(name.endswith(".c") for name in sources):
         raise BuildError(f"{path}: there is no C source (*.c) to build it from")
-    used = compilers(every_platform)
-    with ThreadPoolExecutor(len(used)) as pool:
-        built = pool.map(lambda each: each.library(sources, identifier, warnings), used)
-        libraries = dict(zip((each.platform for each in used), built, strict=True))
-    macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]
+    libraries = _libraries(compilers(every_platform), sources, identifier, warnings)
     members = {**(files or {}), "modelDescription.xml": text}
-    members |= {f"sources/{name}": data for name, data in sources.items()}
+    for name, data in sources.items():
+        members[f"sources/{name}"] = data
+    macos = [data for platform, data in libraries.items() if platform.suffix == ".dylib"]
     for platform, library in libraries.items():
         folder = platform.folder(version)
+        name = f"binaries/{folder}/{identifier}{platform.suffix}"
         # FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both
         # are built, lies a universal binary.
         universal = folder == "darwin64" and len(macos) > 1
-        name = f"binaries/{folder}/{identifier}{platform.suffix}"
         members[name] = universal_binary(macos) if universal else library
     return write_archive(members, path)
 
 
-def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
-    """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into the FMU `target`.
+def _libraries(
+    compilers: Sequence[Compiler],
+    sources: Mapping[str, bytes],
+    identifier: str,
+    warnings: tuple[str, ...],
+) -> dict[Platform, bytes]:
+    """The shared library of each platform, all compiled at once."""
+    with ThreadPoolExecutor(len(compilers)) as pool:
+        running = {
+            compiler.platform: pool.submit(compiler.library, sources, identifier, warnings)
+            for compiler in compilers
+        }
+        return {platform: future.result() for platform, future in running.items()}
 
-    As `build_fmu`; raises OSError where there is no model description.
+
+def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
+    """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into an FMU.
+
+    Args:
+        folder: where these files lie.
+        target: path of the FMU.
+        every_platform: build for each of `PLATFORMS`, and not for the platform at hand alone.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        OSError: if there is no model description.
+        BuildError: as `build_fmu`.
     """
     text = (Path(folder) / "modelDescription.xml").read_bytes()
     sources = {path.name: path.read_bytes() for path in Path(folder).glob("*.[ch]")}
@@ -282,13 +320,7 @@ def _model(description: bytes) -> tuple[str, str]:
 
 # The evaporator's sources that serve any model: FMI's functions and their parts.
 _FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
-_WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
 HEADER = "variables.h"
-# Stored results name the evaporator's file by its bytes: it keeps the token of its first build.
-_KEPT_TOKENS = {
-    "{057e4cbf-b1fc-5409-a668-78ce31bbba02}": "{4b2ab9db-c6a8-56b3-80d2-38ec28c993f3}",
-    "{3acfd11f-6951-5208-9ac5-27f319c4be69}": "{71dc0d9d-04bb-5505-8f86-367bbed9bbb2}",
-}
 
 
 def files_of(folder: str) -> dict[str, bytes]:
@@ -297,10 +329,20 @@ def files_of(folder: str) -> dict[str, bytes]:
 
 
 def sources_of(model: FmuModel, version: FmiVersion) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own."""
-    paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
-    paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
-    files = {path.name: path.read_bytes() for path in paths}
+    """The files of the folder `sources/` of an FMU.
+
+    Args:
+        model: its own sources replace those that serve any model.
+        version: major version of FMI.
+
+    Returns:
+        Content by file name.
+    """
+    files = {}
+    for name in (*_FACES, f"fmi{version}.c"):
+        files[name] = (SOURCES / name).read_bytes()
+    # Without derivatives, unless the model has some of its own.
+    files["derivatives.h"] = (PACKAGE / "plant_sources" / "derivatives.h").read_bytes()
     if model.sampled:
         files |= _sampled_sources(model, version)
     files |= model.sources
@@ -318,18 +360,24 @@ def _sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
         first_parameter=first_output + kinds.count(Kind.OUTPUT),
         sampling_time=float(system.step_size),
     )
-    own = files_of("sampled_sources") | {"system.h": header.encode()}
-    if version == 3:  # its functions for scalars, and the adapter for the model's arrays
-        elements = dict.fromkeys(range(len(kinds)), (1, 0))
-        for array in system.arrays.values():
-            places = [system.value_reference(variable.name) for variable in array]
-            for k, place in enumerate(places):
-                elements[place] = (0 if k else len(places), places[(k + 1) % len(places)])
-        own["arrays.h"] = render("arrays.h", model=system, elements=elements.values()).encode()
-        last = b'#include "snapshot.h"\n'
-        scalars = (SOURCES / "fmi3.c").read_bytes()
-        own["fmi3.c"] = scalars.replace(last, last + b'#include "arrays.h"\n')
-    return own
+    sources = files_of("sampled_sources")
+    sources["system.h"] = header.encode()
+    if version == 2:
+        return sources
+    # FMI 3.0 has its functions for scalars, and an adapter for the model's arrays.
+    elements = dict.fromkeys(range(len(kinds)), (1, 0))
+    for array in system.arrays.values():
+        references = [system.value_reference(variable.name) for variable in array]
+        # The first element stands for the array and has its size; each points to the next.
+        for k, reference in enumerate(references):
+            size = len(references) if k == 0 else 0
+            elements[reference] = (size, references[(k + 1) % len(references)])
+    adapter = render("arrays.h", model=system, elements=elements.values())
+    sources["arrays.h"] = adapter.encode()
+    last_include = b'#include "snapshot.h"\n'
+    scalars = (SOURCES / "fmi3.c").read_bytes()
+    sources["fmi3.c"] = scalars.replace(last_include, last_include + b'#include "arrays.h"\n')
+    return sources
 
 
 def build_model(
@@ -341,19 +389,31 @@ def build_model(
     files: Mapping[str, bytes] | None = None,
     warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
-    """Build the FMU `target` of a model, with a page of its variables.
+    """Build the FMU of a model, with a page of its variables; with the same compiler, equal bytes.
 
-    `files` are further members of the archive. As `build_fmu`, whose BuildError it raises; with the
-    same compiler the bytes repeat.
+    Args:
+        model: its table of variables and its sources.
+        target: path of the FMU.
+        version: major version of FMI.
+        every_platform: build for each of `PLATFORMS`, and not for the platform at hand alone.
+        files: further members by their path in the archive.
+        warnings: compiler options that choose what it warns of.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        BuildError: as `build_fmu`.
     """
     sources = sources_of(model, version)
     page = render("model.html", model=model, version=version)
     members = {
         "documentation/index.html": page.encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
-        **(terminals(model) if version == 3 else {}),
-        **(files or {}),
     }
+    if version == 3:
+        members |= terminals(model)
+    members |= files or {}
     text = model_description(version, token_of(model, version, sources), model)
     return build_fmu(
         target, sources, text, every_platform=every_platform, files=members, warnings=warnings
@@ -361,25 +421,38 @@ def build_model(
 
 
 def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
-    """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model."""
+    """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model.
+
+    Args:
+        model: its description counts.
+        version: major version of FMI.
+        sources: content by file name; generated files, which hold the token, do not count.
+    """
     digest = hashlib.sha256(model_description(version, "", model).encode())
-    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):  # they are generated
+    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):
         digest.update(name.encode() + b"\0" + sources[name])
-    token = "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
-    return _KEPT_TOKENS.get(token, token)
+    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
 
 
 def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:
     """The variables of a sampled model, a function of inputs and parameters.
 
-    `signals` are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
-    parameters; every output depends on every input and parameter. Raises BuildError on names that
-    are taken twice, in FMI or in C.
+    Args:
+        signals: real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
+            parameters.
+
+    Returns:
+        The table: time, then the signals; every output depends on every input and parameter.
+
+    Raises:
+        BuildError: if two names are the same, in FMI or in C.
     """
-    time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
-    known = tuple(v.name for v in signals if v.settable)
-    table = (time, *(v if v.settable else replace(v, uses=known) for v in signals))
+    table = [Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")]
+    known = tuple(signal.name for signal in signals if signal.settable)
+    for signal in signals:
+        table.append(signal if signal.settable else replace(signal, uses=known))
     for names in ([v.name for v in table], [v.identifier for v in table]):
-        if twice := next((each for each in names if names.count(each) > 1), None):
-            raise BuildError(f"two variables are called '{twice}'")
-    return table
+        for name in names:
+            if names.count(name) > 1:
+                raise BuildError(f"two variables are called '{name}'")
+    return tuple(table)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from cosim.files import temporary_folder
 from fmus import NAMES, BuildError, plant
 from fmus.build import (
     COMPILER_FLAGS,
@@ -50,42 +50,52 @@ BUILD_FILE = "extra/org.rti-cosim/build.json"
 
 def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
     """How the binaries were made (JSON): for each platform the compiler and its flags."""
+    platforms = {}
+    for compiler in compilers(every_platform):
+        platforms[compiler.platform.tuple] = {
+            "compiler": compiler.version,
+            "target": compiler.platform.target,
+            "linker_flags": list(compiler.linker_flags),
+        }
     record = {
         "compiler_flags": [*COMPILER_FLAGS, *WARNINGS],
-        "platforms": {
-            compiler.platform.tuple: {
-                "compiler": compiler.version,
-                "target": compiler.platform.target,
-                "linker_flags": list(compiler.linker_flags),
-            }
-            for compiler in compilers(every_platform)
-        },
+        "platforms": platforms,
         "model_token": token_of(EVAPORATOR, version, sources_of(EVAPORATOR, version)),
     }
     return (json.dumps(record, indent=2) + "\n").encode()
 
 
 def build(folder: Path, every_platform: bool = False) -> list[Path]:
-    """Build both FMUs into `folder` (made when missing) and return their paths.
+    """Build both FMUs of the evaporator.
 
-    For the platform at hand by the local compiler, or for every one by the extra ``cross``.
+    Args:
+        folder: where they are written; made when missing.
+        every_platform: build for each of `PLATFORMS`, by the extra ``cross``, and not for the
+            platform at hand alone, by the local compiler.
+
+    Returns:
+        Their paths.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    diagram = (RESOURCES / "diagram.svg").read_text(encoding="utf-8")
     icons: dict[FmiVersion, str] = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
     built = []
     for name, (version, icon) in zip(NAMES, icons.items(), strict=True):
-        files = {icon: (RESOURCES / "icon.png").read_bytes()}
-        files["documentation/index.html"] = render(
+        page = render(
             "evaporator.html",
             model=EVAPORATOR,
             version=version,
-            diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
+            diagram=diagram,
             build_file=BUILD_FILE,
-        ).encode()
-        files[BUILD_FILE] = _build_record(version, every_platform)
+        )
+        files = {
+            icon: (RESOURCES / "icon.png").read_bytes(),
+            "documentation/index.html": page.encode(),
+            BUILD_FILE: _build_record(version, every_platform),
+        }
         if version == 3:
             files |= terminals(EVAPORATOR, icon=True)
-        made = build_model(
+        path = build_model(
             EVAPORATOR,
             folder / f"{name}.fmu",
             version,
@@ -93,28 +103,42 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
             files=files,
             warnings=WARNINGS,
         )
-        built.append(made)
+        built.append(path)
     return built
 
 
 def differences(built: Path, shipped: Path) -> list[str]:
-    """The archive members that differ between two FMU files, or ``["(order or metadata)"]``.
+    """The archive members that differ between two FMU files.
 
-    Empty when the files are equal byte for byte. Raises BuildError when `shipped` is missing.
+    Args:
+        built: one file.
+        shipped: the other.
+
+    Returns:
+        Names of the members, ``["(order or metadata)"]`` where these alone differ; empty when the
+        files are equal byte for byte.
+
+    Raises:
+        BuildError: if `shipped` is missing.
     """
     if not shipped.is_file():
         raise BuildError(f"{shipped} is missing; reinstall the package")
     if built.read_bytes() == shipped.read_bytes():
         return []
-    with zipfile.ZipFile(built) as one, zipfile.ZipFile(shipped) as other:
-        first, second = ({e.filename: e.CRC for e in each.infolist()} for each in (one, other))
-    differing = {name for name, _ in first.items() ^ second.items()}
-    return sorted(differing) or ["(order or metadata)"]
+    checksums = _checksums(built).items() ^ _checksums(shipped).items()
+    return sorted({name for name, _ in checksums}) or ["(order or metadata)"]
+
+
+def _checksums(path: Path) -> dict[str, int]:
+    """CRC of each member of an archive by its name."""
+    with zipfile.ZipFile(path) as archive:
+        return {member.filename: member.CRC for member in archive.infolist()}
 
 
 def compare_with_shipped() -> dict[str, list[str]]:
     """Build anew for every platform; file name → `differences` from the shipped file."""
-    with temporary_folder("cosim-") as folder:
+    with TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as name:
+        folder = Path(name).absolute()
         built = [*build(folder, every_platform=True), *plant.build(folder, every_platform=True)]
         return {path.name: differences(path, PACKAGE / path.name) for path in built}
 

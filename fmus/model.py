@@ -7,7 +7,7 @@ import hashlib
 import html
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from fractions import Fraction
@@ -75,20 +75,23 @@ class Variable:
 
 def read_variables(file: Path) -> list[Variable]:
     """The table of variables in a CSV file with a column for each field of `Variable`."""
-    numbers = ("start", "min", "max", "nominal")
+    variables = []
     with file.open(encoding="utf-8", newline="") as lines:
-        return [
-            Variable(
+        for row in csv.DictReader(lines):
+            numbers = {}
+            for key in ("start", "min", "max", "nominal"):
+                numbers[key] = float(row[key]) if row[key] else None
+            variable = Variable(
                 row["name"],
                 Kind[row["kind"]],
                 Type[row["type"]],
                 row["unit"],
-                **{key: float(row[key]) if row[key] else None for key in numbers},
+                **numbers,
                 description=row["description"],
                 uses=tuple(row["uses"].split()),
             )
-            for row in csv.DictReader(lines)
-        ]
+            variables.append(variable)
+    return variables
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,7 @@ _TABLE = (Path(__file__).parent / "resources" / "units.csv").read_text(encoding=
 _SIMPLE = {row["name"]: row for row in csv.DictReader(_TABLE.splitlines())}
 _QUOTIENT = re.compile(r"[^/()]*(/(\([^/()]*\)|[^/().]*))*")
 _POWER = re.compile(r"(1|[A-Za-z%]+)(-?\d+)?")
+_EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
 _BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
@@ -124,22 +128,26 @@ def unit(name: str) -> Unit:
     They are written as in FMI: ``kg/min``, ``1/s``, ``cm3/(V.s)``. An offset has only a unit that
     stands alone.
     """
+    unknown = Unit(name, exponents=None)
     if not _QUOTIENT.fullmatch(name):
-        return Unit(name, exponents=None)
-    factor, powers = Fraction(1), dict.fromkeys(_BASE, 0)
-    for place, part in enumerate(name.split("/")):
-        for each in part.strip("()").split(".") if part else ():
-            found = _POWER.fullmatch(each)
-            if found is None or found[1] not in _SIMPLE:
-                return Unit(name, exponents=None)
-            power = int(found[2] or 1) * (-1 if place else 1)
-            factor *= Fraction(_SIMPLE[found[1]]["factor"]) ** power
-            for base, exponent in re.findall(r"([A-Za-z]+)(-?\d+)", _SIMPLE[found[1]]["exponents"]):
-                powers[base] += power * int(exponent)
-    offset = Fraction(_SIMPLE[name]["offset"] if name in _SIMPLE else 0)
-    return Unit(
-        name, float(factor), float(offset), {b: power for b, power in powers.items() if power}
-    )
+        return unknown
+    factor = Fraction(1)
+    exponents = dict.fromkeys(_BASE, 0)
+    for position, part in enumerate(name.split("/")):
+        sign = -1 if position else 1  # numerator first
+        symbols = part.strip("()").split(".") if part else []
+        for symbol in symbols:
+            match = _POWER.fullmatch(symbol)
+            if match is None or match[1] not in _SIMPLE:
+                return unknown
+            simple = _SIMPLE[match[1]]
+            power = sign * int(match[2] or 1)
+            factor *= Fraction(simple["factor"]) ** power
+            for base, exponent in _EXPONENT.findall(simple["exponents"]):
+                exponents[base] += power * int(exponent)
+    offset = Fraction(_SIMPLE[name]["offset"]) if name in _SIMPLE else Fraction(0)
+    occurring = {base: exponent for base, exponent in exponents.items() if exponent}
+    return Unit(name, float(factor), float(offset), occurring)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +155,9 @@ class FmuModel:
     """A model: its name, C identifier, table of variables, interfaces and C sources.
 
     A variable's value reference is its position in the table. `step_size` [s] is that of the
-    default experiment, of 100 steps; `model_exchange` and `derivatives` (directional, in FMI 3.0
-    adjoint, too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the
-    multiples of `step_size` alone: its outputs are discrete, and no communication step may pass
-    over a sample.
+    default experiment, of 100 steps; `model_exchange` and `derivatives` (directional) say what it
+    offers beside co-simulation. Where it is `sampled`, it acts at the multiples of `step_size`
+    alone: its outputs are discrete, and no communication step may pass over a sample.
     Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
     variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
     names. `units` gives the order of the variables' units where it shall not be the table's own.
@@ -175,12 +182,14 @@ class FmuModel:
     @cached_property
     def arrays(self) -> dict[str, list[Variable]]:
         """The elements of FMI 3.0's arrays, in table order, by the arrays' names."""
-        found: dict[str, list[Variable]] = {}
-        for variable in self.variables if self.sampled else ():
+        arrays: dict[str, list[Variable]] = {}
+        if not self.sampled:
+            return arrays
+        for variable in self.variables:
             name, bracket, _ = variable.name.partition("[")
             if bracket and variable.type is Type.REAL:
-                found.setdefault(name, []).append(variable)
-        return found
+                arrays.setdefault(name, []).append(variable)
+        return arrays
 
     @cached_property
     def by_name(self) -> dict[str, Variable]:
@@ -204,41 +213,63 @@ class FmuModel:
         """
         if version == 2:
             return [v for v in self.variables if v.kind is not Kind.INDEPENDENT]
-        shown = {v: v for v in self.variables if v.type not in (Type.SEED_HIGH, Type.LAW_NUMBER)}
+        shown = {}
+        for variable in self.variables:
+            if variable.type not in (Type.SEED_HIGH, Type.LAW_NUMBER):
+                shown[variable] = variable
         for name, elements in self.arrays.items():
-            texts = [v.description for v in elements]
-            about = commonprefix(texts).rstrip(", ")  # noqa: RUF071 (no paths)
-            order = " ".join(v.name.removeprefix(name) for v in elements)
-            shown[elements[0]] = replace(elements[0], name=name, description=f"{about}: {order}")
-            for element in elements[1:]:
+            # The array says what is common to its elements, and in which order they are.
+            common = commonprefix([element.description for element in elements])  # noqa: RUF071
+            indices = [element.name.removeprefix(name) for element in elements]
+            description = f"{common.rstrip(', ')}: {' '.join(indices)}"
+            first, *others = elements
+            shown[first] = replace(first, name=name, description=description)
+            for element in others:
                 del shown[element]
         return list(shown.values())
 
 
 @cache
 def closure(name: str, model: FmuModel) -> frozenset[str]:
-    """All variables that calculated variable `name` depends on, states not resolved further."""
-    found: set[str] = set()
+    """All variables that a calculated variable depends on, states not resolved further.
+
+    Args:
+        name: of the variable.
+        model: the table that it is in.
+    """
+    names: set[str] = set()
     for used in model.by_name[name].uses:
-        found.add(used)
+        names.add(used)
         if model.by_name[used].kind in (Kind.OUTPUT, Kind.DERIVATIVE):
-            found |= closure(used, model)
-    return frozenset(found)
+            names |= closure(used, model)
+    return frozenset(names)
 
 
 def continuous_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
-    """States and inputs that `name` depends on during the simulation, in table order."""
+    """States and inputs that a variable depends on during the simulation, in table order.
+
+    Args:
+        name: of the variable.
+        model: the table that it is in.
+    """
     if model.by_name[name].kind is Kind.STATE:
         return (name,)
     known = closure(name, model)
-    return tuple(n for n in model.names(Kind.STATE, Kind.INPUT) if n in known)
+    return tuple(other for other in model.names(Kind.STATE, Kind.INPUT) if other in known)
 
 
 def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
-    """Parameters and inputs that `name` depends on at initialisation, in table order."""
-    names = set(closure(name, model))
-    for state in [n for n in names if model.by_name[n].kind is Kind.STATE]:
-        names |= closure(state, model)
+    """Parameters and inputs that a variable depends on at initialisation, in table order.
+
+    Args:
+        name: of the variable.
+        model: the table that it is in.
+    """
+    direct = closure(name, model)
+    names = set(direct)
+    for known in direct:
+        if model.by_name[known].kind is Kind.STATE:  # which depends on its start parameter
+            names |= closure(known, model)
     return tuple(v.name for v in model.variables if v.name in names and v.settable)
 
 
@@ -279,8 +310,12 @@ def _xml(text: str) -> str:
 
 
 def _attributes(values: Attributes) -> str:
-    pairs = ((key, value) for key, value in values.items() if value is not None)
-    return "".join(f' {key}="{_xml(str(value))}"' for key, value in pairs)
+    """XML attributes, but for those that are None."""
+    text = ""
+    for key, value in values.items():
+        if value is not None:
+            text += f' {key}="{_xml(str(value))}"'
+    return text
 
 
 def _number(value: float) -> str:
@@ -300,7 +335,21 @@ _CAUSALITY = {
 
 
 def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
-    """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
+    """The text of modelDescription.xml.
+
+    Args:
+        version: major version of FMI.
+        token: GUID of FMI 2.0 or instantiation token of FMI 3.0.
+        model: the model that is described.
+    """
+    if model.units:
+        unit_names = list(model.units)
+    else:  # each once, in the order of the table
+        unit_names = list(dict.fromkeys(v.unit for v in model.variables if v.unit))
+    variables = []
+    for variable in model.exported(version):
+        element, attributes = _type(version, variable, model)
+        variables.append((_common_attributes(variable, model), element, attributes))
     return render(
         "modelDescription.xml",
         version=version,
@@ -309,22 +358,23 @@ def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
         # The shipped files stay the same from one version to the next.
         tool=f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
         types={variable.type.name for variable in model.variables},
-        units=[
-            unit(name)
-            for name in model.units or dict.fromkeys(v.unit for v in model.variables if v.unit)
-        ],
-        variables=[
-            (_common_attributes(variable, model), *_type(version, variable, model))
-            for variable in model.exported(version)
-        ],
+        units=[unit(name) for name in unit_names],
+        variables=variables,
         structure=_structure(version, model),
     )
 
 
 def terminals(model: FmuModel, icon: bool = False) -> dict[str, bytes]:
-    """FMI 3.0's terminalsAndIcons.xml by its path, if the `model` has a terminal; with an icon."""
+    """FMI 3.0's terminalsAndIcons.xml by its path, if the model has a terminal.
+
+    Args:
+        model: the model.
+        icon: whether the archive holds an icon, too.
+    """
+    if not model.terminal:
+        return {}
     text = render("terminalsAndIcons.xml", model=model, icon=icon)
-    return {"terminalsAndIcons/terminalsAndIcons.xml": text.encode()} if model.terminal else {}
+    return {"terminalsAndIcons/terminalsAndIcons.xml": text.encode()}
 
 
 def build_description(version: FmiVersion, model: FmuModel) -> str:
@@ -351,30 +401,39 @@ def _common_attributes(variable: Variable, model: FmuModel) -> Attributes:
 
 def _type(version: FmiVersion, variable: Variable, model: FmuModel) -> tuple[str, Attributes]:
     """The element of a variable's type and its attributes."""
-    if variable.type is Type.BOOLEAN:
-        return "Boolean", {"start": "true" if variable.start else "false"}
-    if variable.type is Type.LAW:
-        return "Enumeration", {"declaredType": "Law", "min": 1, "max": 2, "start": 1}
-    if variable.type is Type.LAW_NUMBER:
-        return "Integer", {"min": 0, "max": 2, "start": 0}
-    if variable.type in (Type.SEED, Type.SEED_HIGH):
-        if version == 3:
+    match variable.type:
+        case Type.BOOLEAN:
+            return "Boolean", {"start": "true" if variable.start else "false"}
+        case Type.LAW:
+            return "Enumeration", {"declaredType": "Law", "min": 1, "max": 2, "start": 1}
+        case Type.LAW_NUMBER:
+            return "Integer", {"min": 0, "max": 2, "start": 0}
+        case Type.SEED | Type.SEED_HIGH if version == 3:
             return "UInt64", {"min": 0, "max": 2**64 - 1, "start": 0}
-        return "Integer", {"min": -(2**31), "max": 2**31 - 1, "start": 0}
+        case Type.SEED | Type.SEED_HIGH:
+            return "Integer", {"min": -(2**31), "max": 2**31 - 1, "start": 0}
+        case _:
+            element = "Real" if version == 2 else "Float64"
+            return element, _real_attributes(version, variable, model)
+
+
+def _real_attributes(version: FmiVersion, variable: Variable, model: FmuModel) -> Attributes:
     attributes: dict[str, object] = {"unit": variable.unit or None}
     for key in ("min", "max", "nominal", "start"):
         value = getattr(variable, key)
-        if value is not None and not (key == "nominal" and value == 0.0):
+        no_nominal = key == "nominal" and value == 0.0  # which FMI forbids
+        if value is not None and not no_nominal:
             attributes[key] = float(value)
     if variable.start is not None and variable.name in model.arrays:
-        starts = [v.start or 0.0 for v in model.arrays[variable.name]]
-        attributes["start"] = " ".join(str(float(start)) for start in starts)
+        elements = model.arrays[variable.name]
+        attributes["start"] = " ".join(str(float(v.start or 0.0)) for v in elements)
     if variable.kind is Kind.DERIVATIVE:
         state = variable.name.removeprefix("der(").removesuffix(")")
         attributes["derivative"] = _numbering(version, model)(state)
-    if version == 3 and variable.kind in (Kind.STATE, Kind.OUTPUT) and not model.sampled:
+    calculated = variable.kind in (Kind.STATE, Kind.OUTPUT)
+    if version == 3 and calculated and not model.sampled:
         attributes["intermediateUpdate"] = "true"
-    return "Real" if version == 2 else "Float64", attributes
+    return attributes
 
 
 def _numbering(version: FmiVersion, model: FmuModel) -> Callable[[str], int]:
@@ -397,32 +456,38 @@ _UNKNOWNS = (
 def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, list[Attributes]]]:
     """The unknowns of ModelStructure by group, with their dependencies."""
     number = _numbering(version, model)
+    reference = "index" if version == 2 else "valueReference"
     shown = {model.by_name[variable.name].name for variable in model.exported(version)}
-
-    def unknown(name: str, dependencies: Sequence[str]) -> Attributes:
-        numbers = [str(number(n)) for n in dependencies if n in shown]
-        # The states depend on themselves or on their start with constant factor 1.
-        kind = "constant" if model.by_name[name].kind is Kind.STATE else "dependent"
-        return {
-            "index" if version == 2 else "valueReference": number(name),
-            "dependencies": " ".join(numbers),
-            "dependenciesKind": " ".join([kind] * len(numbers)),
-        }
-
-    return [
-        (tag, group, [unknown(name, dependencies(name, model)) for name in names])
-        for tag, group, kinds, dependencies in _UNKNOWNS
-        if (names := [name for name in model.names(*kinds) if name in shown])
-    ]
+    structure = []
+    for element, group, kinds, dependencies_of in _UNKNOWNS:
+        unknowns: list[Attributes] = []
+        for name in model.names(*kinds):
+            if name not in shown:
+                continue
+            known = [d for d in dependencies_of(name, model) if d in shown]
+            # The states depend on themselves or on their start with constant factor 1.
+            kind = "constant" if model.by_name[name].kind is Kind.STATE else "dependent"
+            unknown = {
+                reference: number(name),
+                "dependencies": " ".join(str(number(dependency)) for dependency in known),
+                "dependenciesKind": " ".join([kind] * len(known)),
+            }
+            unknowns.append(unknown)
+        if unknowns:
+            structure.append((element, group, unknowns))
+    return structure
 
 
 def c_header(token: str, model: FmuModel) -> str:
-    """The header's text: value references, types, starts and ranges, and the model's `token`.
+    """The text of variables.h: value references, types, starts, ranges, and the model's token.
 
-    The C of a sampled model checks every variable against a range.
+    The C of a sampled model checks every variable against a range. With the header FMI's functions
+    are called ``identifier_fmi2…`` and so on, so that several models link into one program; whoever
+    builds a library defines FMI2_ or FMI3_OVERRIDE_FUNCTION_PREFIX.
 
-    With it FMI's functions are called ``identifier_fmi2…`` and so on, so that several models link
-    into one program; whoever builds a library defines FMI2_ or FMI3_OVERRIDE_FUNCTION_PREFIX.
+    Args:
+        token: GUID or instantiation token.
+        model: the model.
     """
     names = "\n".join(variable.name for variable in model.variables)
     return render(
@@ -430,6 +495,7 @@ def c_header(token: str, model: FmuModel) -> str:
         token=token,
         model=model,
         origin=model.origin or f"the table of {model.name}",
+        # A serialised state of another table is refused.
         layout=hashlib.sha256(names.encode()).hexdigest()[:16],
         types=list(Type.__members__),
         kinds=list(Kind.__members__),
@@ -444,4 +510,5 @@ def _numbers(most: float, variable: Variable) -> tuple[float, ...]:
     if variable.type in (Type.SEED, Type.SEED_HIGH):
         low, high = 0.0, 2.0**32 - 1
     nominal = 1.0 if variable.nominal is None else variable.nominal
+    # Nothing and −0.0 are written as 0.0.
     return tuple(float(number or 0.0) for number in (variable.start, low, high, nominal))

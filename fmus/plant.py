@@ -39,12 +39,25 @@ class Signal:
     range: float = 0.0
 
     def variable(self, kind: Kind, uses: tuple[str, ...] = ()) -> Variable:
-        """The signal as a row of a table; one that is calculated `uses` others and has no start."""
-        start = None if kind in (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT) else self.start
+        """The signal as a row of a table.
+
+        Args:
+            kind: its role; what is calculated has no start.
+            uses: names of the variables that its equation needs.
+        """
+        calculated = kind in (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT)
         return Variable(
-            self.name, kind, Type.REAL, self.unit, start, self.min, self.max,
-            abs(self.start) or 1.0, self.description, uses,
-        )  # fmt: skip
+            self.name,
+            kind,
+            Type.REAL,
+            self.unit,
+            start=None if calculated else self.start,
+            min=self.min,
+            max=self.max,
+            nominal=abs(self.start) or 1.0,
+            description=self.description,
+            uses=uses,
+        )
 
 
 def plant_model(
@@ -61,44 +74,50 @@ def plant_model(
     """The table of an FMU from the signals of a plant.
 
     Each state x has a derivative ``der(x)`` (in C ``VR_der_x``) and a start parameter ``x_start``,
-    each disturbance d a mean ``d_nominal`` and a ``d_range``; beside them are the switches
+    each disturbance d a mean ``d_nominal`` and a ``d_range``. Beside them are the switches:
     ``stochastic``, ``law`` (1 uniform, 2 normal; FMI 2.0 has an integer ``law_number``, too),
-    ``seed``, ``seedHigh`` (FMI 2.0), ``sampling_time`` [s], whose multiples are when the
-    disturbances are drawn anew, and ``saturate``, with which an input beyond its range acts at the
-    bound.
+    ``seed``, ``seedHigh`` (FMI 2.0), ``sampling_time`` [s] and ``saturate``, with which an input
+    beyond its range acts at the bound.
+
+    Args:
+        name: the model's name, a C identifier.
+        states: with the values at the start.
+        inputs: with their defaults.
+        disturbances: drawn anew at the multiples of the sampling time.
+        outputs: what else the equations set.
+        parameters: of the equations, tunable.
+        sampling_time: in s.
+        description: of the plant, for the model description.
+
+    Returns:
+        The model; `build_plant` makes its FMU.
     """
-    switches = [
-        replace(v, start=sampling_time, nominal=sampling_time) if v.name == "sampling_time" else v
-        for v in read_variables(RESOURCES / "switches.csv")
-    ]
-    drawn = (*(each.name for each in switches if each.name != "saturate"), "time")
     known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
-    table = [
-        Variable("time", Kind.INDEPENDENT, unit="s", description="time"),
-        *(s.variable(Kind.STATE, (f"{s.name}_start",)) for s in states),
-        *(
-            Signal(
-                f"der({s.name})", f"{s.unit}/s", s.start, -1e6, 1e6, f"time derivative of {s.name}"
-            ).variable(Kind.DERIVATIVE, known)
-            for s in states
-        ),
-        *(s.variable(Kind.INPUT) for s in inputs),
-        *(
-            d.variable(Kind.OUTPUT, (f"{d.name}_nominal", f"{d.name}_range", *drawn))
-            for d in disturbances
-        ),
-        *(s.variable(Kind.OUTPUT, known) for s in outputs),
-        *switches,
-    ]
-    about = "half width (uniform) or standard deviation (normal)"
-    for d in disturbances:
-        spread = Signal(f"{d.name}_range", d.unit, d.range, 0.0, d.max - d.min, about)
-        mean = replace(d, name=f"{d.name}_nominal", description=f"mean {d.description}")
-        table += [mean.variable(Kind.TUNABLE), spread.variable(Kind.TUNABLE)]
-    for s in states:
-        start = replace(s, name=f"{s.name}_start", description=f"{s.name} at the start")
+    switches = _switches(sampling_time)
+    draws = tuple(v.name for v in switches if v.name != "saturate")
+    table = [Variable("time", Kind.INDEPENDENT, unit="s", description="time")]
+    for state in states:
+        table.append(state.variable(Kind.STATE, uses=(f"{state.name}_start",)))
+    for state in states:
+        about = f"time derivative of {state.name}"
+        rate = Signal(f"der({state.name})", f"{state.unit}/s", state.start, -1e6, 1e6, about)
+        table.append(rate.variable(Kind.DERIVATIVE, uses=known))
+    for signal in inputs:
+        table.append(signal.variable(Kind.INPUT))
+    for disturbance in disturbances:
+        law = (f"{disturbance.name}_nominal", f"{disturbance.name}_range")
+        table.append(disturbance.variable(Kind.OUTPUT, uses=(*law, *draws, "time")))
+    for output in outputs:
+        table.append(output.variable(Kind.OUTPUT, uses=known))
+    table += switches
+    for disturbance in disturbances:
+        table += _law_of(disturbance)
+    for state in states:
+        about = f"{state.name} at the start"
+        start = replace(state, name=f"{state.name}_start", description=about)
         table.append(start.variable(Kind.FIXED))
-    table += [s.variable(Kind.TUNABLE) for s in parameters]
+    for parameter in parameters:
+        table.append(parameter.variable(Kind.TUNABLE))
     return FmuModel(
         name=name,
         identifier=name,
@@ -110,6 +129,27 @@ def plant_model(
     )
 
 
+def _switches(sampling_time: float) -> list[Variable]:
+    """The switches of every plant, at this sampling time [s]."""
+    switches = read_variables(RESOURCES / "switches.csv")
+    for position, variable in enumerate(switches):
+        if variable.name == "sampling_time":
+            switches[position] = replace(variable, start=sampling_time, nominal=sampling_time)
+    return switches
+
+
+def _law_of(disturbance: Signal) -> tuple[Variable, Variable]:
+    """Mean and range of a disturbance, which are its parameters."""
+    name = disturbance.name
+    mean = replace(
+        disturbance, name=f"{name}_nominal", description=f"mean {disturbance.description}"
+    )
+    widest = disturbance.max - disturbance.min
+    about = "half width (uniform) or standard deviation (normal)"
+    spread = Signal(f"{name}_range", disturbance.unit, disturbance.range, 0.0, widest, about)
+    return mean.variable(Kind.TUNABLE), spread.variable(Kind.TUNABLE)
+
+
 def build_plant(
     model: FmuModel,
     equations: str | bytes,
@@ -117,24 +157,39 @@ def build_plant(
     version: FmiVersion = 2,
     every_platform: bool = False,
 ) -> Path:
-    """Compile a plant's equations into the FMU `target`; returns its path.
+    """Compile a plant's equations into an FMU, for co-simulation and model exchange.
 
-    `equations` is a C header that includes ``variables.h`` and defines ``static void
-    evaluate(double v[N_VARIABLES])``: from the states, inputs, disturbances and parameters in `v`,
-    each at its value reference ``VR_name``, it sets the outputs and the states' derivatives per
-    second. FMI 2.0 or 3.0, co-simulation and model exchange; snapshots and their serialisation;
-    draws that are a function of seed and sample; fourth-order Runge–Kutta steps of at most 1 s.
-    Raises BuildError where there is no compiler or it refuses the equations.
+    It has snapshots and their serialisation, draws that are a function of seed and sample, and
+    fourth-order Runge–Kutta steps of at most 1 s.
+
+    Args:
+        model: the table of its variables, by `plant_model`.
+        equations: a C header that includes ``variables.h`` and defines ``static void
+            evaluate(double v[N_VARIABLES])``: from the states, inputs, disturbances and parameters
+            in `v`, each at its value reference ``VR_name``, it sets the outputs and the states'
+            derivatives per second.
+        target: path of the FMU.
+        version: major version of FMI.
+        every_platform: build for each of `PLATFORMS`, and not for the platform at hand alone.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        BuildError: if there is no compiler or it refuses the equations.
     """
-    own = {name: (SOURCES / name).read_bytes() for name in _SHARED} | files_of("plant_sources")
-    own["equations.h"] = equations.encode() if isinstance(equations, str) else equations
-    own["states.h"] = render(
-        "states.h",
-        model=model,
-        states=[model.by_name[name].identifier for name in model.names(Kind.STATE)],
-        drawn=[n.removesuffix("_nominal") for n in model.by_name if n.endswith("_nominal")],
-    ).encode()
-    return build_model(replace(model, sources=own), target, version, every_platform=every_platform)
+    disturbances = []
+    for name in model.by_name:
+        if name.endswith("_nominal"):
+            disturbances.append(name.removesuffix("_nominal"))
+    states = [model.by_name[name].identifier for name in model.names(Kind.STATE)]
+    header = render("states.h", model=model, states=states, drawn=disturbances)
+    sources = {name: (SOURCES / name).read_bytes() for name in _SHARED}
+    sources |= files_of("plant_sources")
+    sources["equations.h"] = equations.encode() if isinstance(equations, str) else equations
+    sources["states.h"] = header.encode()
+    complete = replace(model, sources=sources)
+    return build_model(complete, target, version, every_platform=every_platform)
 
 
 PLANTS = {
@@ -151,13 +206,16 @@ def model(name: str) -> FmuModel:
     signals: dict[str, list[Signal]] = {role: [] for role in _ROLES}
     with (RESOURCES / f"{name}.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            start, low, high = (float(row[key]) for key in ("start", "min", "max"))
-            signals[row["role"]].append(
-                Signal(
-                    row["name"], row["unit"], start, low, high, row["description"],
-                    float(row["range"] or 0.0),
-                )
-            )  # fmt: skip
+            signal = Signal(
+                row["name"],
+                row["unit"],
+                start=float(row["start"]),
+                min=float(row["min"]),
+                max=float(row["max"]),
+                description=row["description"],
+                range=float(row["range"] or 0.0),
+            )
+            signals[row["role"]].append(signal)
     description, sampling_time = PLANTS[name]
     return plant_model(name, description=description, sampling_time=sampling_time, **signals)
 
@@ -168,8 +226,17 @@ def equations(name: str) -> bytes:
 
 
 def build(folder: Path, every_platform: bool = False) -> list[Path]:
-    """Build both FMUs (FMI 2.0) into `folder` and return their paths."""
-    return [
-        build_plant(model(name), equations(name), folder / f"{name}.fmu", 2, every_platform)
-        for name in PLANTS
-    ]
+    """Build the FMUs (FMI 2.0) of `PLANTS`.
+
+    Args:
+        folder: where they are written.
+        every_platform: build for each of `PLATFORMS`, and not for the platform at hand alone.
+
+    Returns:
+        Their paths.
+    """
+    built = []
+    for name in PLANTS:
+        target = folder / f"{name}.fmu"
+        built.append(build_plant(model(name), equations(name), target, 2, every_platform))
+    return built

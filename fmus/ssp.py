@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import fmpy
-from attrs import asdict
 from fmpy.model_description import ModelDescription
 
 from fmus import BuildError
 from fmus.build import write_archive
 from fmus.model import render
+
+BASE_UNIT = ("kg", "m", "s", "A", "K", "mol", "cd", "rad", "factor", "offset")
+"""Attributes of FMI's BaseUnit."""
 
 
 def write_ssp(
@@ -27,41 +29,52 @@ def write_ssp(
     """Write a loop of two FMUs (System Structure and Parameterization); the bytes repeat.
 
     It is SSP 1.0 where both are FMI 2.0, else SSP 2.0, which has FMI 3.0's types. The controller is
-    stepped first. `states`, and the disturbances that it measures, go from the plant to it,
-    `actions` back, by their names in both and with their units; `starts` are the plant's start
-    values with their FMI types. Raises BuildError where an FMU has no co-simulation.
+    stepped first.
+
+    Args:
+        target: path of the archive.
+        controller: path of the controller's FMU.
+        plant: path of the plant's FMU.
+        states: what goes from the plant to the controller, measured disturbances too; the names are
+            those of both, with their units.
+        actions: what goes back, likewise.
+        starts: start values of the plant by name, each with its FMI type.
+        stop_time: of the default experiment, in s.
+
+    Returns:
+        The path of the archive.
+
+    Raises:
+        BuildError: if an FMU has no co-simulation.
     """
-    members: dict[str, bytes] = {}
+    ends = {"controller": (controller, states, actions), "plant": (plant, actions, states)}
     components = []
     versions = set()
     units: dict[str, dict[str, float]] = {}
-    for name, fmu, inputs, outputs in (
-        ("controller", controller, states, actions),
-        ("plant", plant, actions, states),
-    ):
+    members: dict[str, bytes] = {}
+    for name, (fmu, inputs, outputs) in ends.items():
         description = fmpy.read_model_description(str(fmu))
         if description.coSimulation is None:
             raise BuildError(f"{fmu} has no co-simulation interface")
-        versions.add(description.fmiVersion[0])
+        version = description.fmiVersion[0]
+        versions.add(version)
         members[f"resources/{name}.fmu"] = fmu.read_bytes()
-        known = {u.name: asdict(u.baseUnit) for u in description.unitDefinitions if u.baseUnit}
+        known = _base_units(description)
         unit_of = {v.name: v.unit for v in description.modelVariables if v.unit in known}
-        units |= {unit: known[unit] for each in (*inputs, *outputs) if (unit := unit_of.get(each))}
-        connectors = [
-            (kind, each, {"unit": unit_of.get(each)})
-            for kind, names in (("input", inputs), ("output", outputs))
-            for each in names
-        ]
-        real = "Real" if description.fmiVersion[0] == "2" else "Float64"
-        about = {"name": name, "starts": name == "plant", "real": real}
-        components.append((about, connectors))
-    connections = [
-        {"start": (one, name), "end": (other, name)}
-        for one, other, names in (("plant", "controller", states), ("controller", "plant", actions))
-        for name in names
-    ]
+        connectors = []
+        for kind, names in (("input", inputs), ("output", outputs)):
+            for signal in names:
+                unit = unit_of.get(signal)
+                if unit is not None:
+                    units[unit] = known[unit]
+                connectors.append((kind, signal, {"unit": unit}))
+        real = "Real" if version == "2" else "Float64"
+        component = {"name": name, "starts": name == "plant", "real": real}
+        components.append((component, connectors))
+    connections = [_connection("plant", "controller", signal) for signal in states]
+    connections += [_connection("controller", "plant", signal) for signal in actions]
     ssp = "1.0" if versions == {"2"} else "2.0"
-    parameters = _parameters(description, starts)
+    parameters = _parameters(fmpy.read_model_description(str(plant)), starts)
     members["resources/plant.ssv"] = render(
         "parameters.ssv", version=ssp, name="plant", parameters=parameters
     ).encode()
@@ -77,20 +90,38 @@ def write_ssp(
     return write_archive(members, Path(target))
 
 
+def _base_units(description: ModelDescription) -> dict[str, dict[str, float]]:
+    """The attributes of BaseUnit of each unit that has one, by the unit's name."""
+    units = {}
+    for unit in description.unitDefinitions:
+        if unit.baseUnit:
+            units[unit.name] = {key: getattr(unit.baseUnit, key) for key in BASE_UNIT}
+    return units
+
+
+def _connection(source: str, sink: str, signal: str) -> dict[str, tuple[str, str]]:
+    """A connection of two components' connectors of one name."""
+    return {"start": (source, signal), "end": (sink, signal)}
+
+
 def _parameters(
     plant: ModelDescription, starts: Mapping[str, tuple[str, float]]
 ) -> list[tuple[str, str, str]]:
     """Name, element and text of each start value."""
     types = {variable.name: variable.declaredType for variable in plant.modelVariables}
     parameters = []
-    for name, (stated, value) in starts.items():
+    for name, (kind, value) in starts.items():
         # Importers of FMI 2.0 set an enumeration through its number.
-        number = stated == "Enumeration" and plant.fmiVersion[0] == "2"
-        kind = "Integer" if number else stated
-        text = repr(float(value)) if kind in ("Real", "Float64", "Float32") else str(int(value))
-        if kind == "Boolean":
+        if kind == "Enumeration" and plant.fmiVersion[0] == "2":
+            kind = "Integer"  # noqa: PLW2901
+        if kind in ("Real", "Float64", "Float32"):
+            text = repr(float(value))
+        elif kind == "Boolean":
             text = "true" if value else "false"
         elif kind == "Enumeration":
-            text = next(item.name for item in types[name].items if item.value == text)
+            names = {item.value: item.name for item in types[name].items}
+            text = names[str(int(value))]
+        else:
+            text = str(int(value))
         parameters.append((name, kind, text))
     return parameters

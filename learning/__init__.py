@@ -1,7 +1,8 @@
 """Learning of an NMPC's θ from plant data: the rules, and all that an own one needs."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import lazy_loader
 
 from learning.actor_critic import ActorCritic
 from learning.algorithm import Algorithm, Strategy, Transition, Update, algorithms
@@ -30,9 +31,7 @@ __all__ = [
     "Transition", "Update", "algorithms", "arrays_of", "take_up", "td_step", "train",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    if name not in ("Tracker", "Training", "TrainingRun", "train"):
-        raise AttributeError(f"module 'learning' has no attribute '{name}'")
-    # On first use: half a second of imports that a rule does not need.
-    return getattr(import_module("learning.training"), name)
+# Imported on first use: half a second that a rule does not need.
+__getattr__, _, _ = lazy_loader.attach(
+    __name__, submod_attrs={"training": ["Tracker", "Training", "TrainingRun", "train"]}
+)

@@ -33,7 +33,7 @@ from cosim.result import Result, csv_text
 from cosim.scenario import Scenario
 from cosim.simulation import functions_of, indicators_of, reporting, simulate, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
-from cosim.validation import known_keywords, suggestion
+from cosim.validation import suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Strategy, TrainingLoop, Update, load_algorithm
 from learning.commissioning import back_off, spare
@@ -498,7 +498,6 @@ class Tracker(Protocol):
         """Take the result, finished or diverged."""
 
 
-@known_keywords
 def train(
     algorithm: str,
     scenario: Scenario | str | Path = "paper",

@@ -42,7 +42,6 @@ from controllers.sensitivities import (
 from controllers.theta import Parameters
 from cosim.protocols import CompiledLoop, Matrix, Vector
 from cosim.scenario import Scenario
-from cosim.validation import known_keywords
 
 
 class LinearisationPoint(NamedTuple):
@@ -439,7 +438,6 @@ class RtiNmpc:
     memoryless = True
     """A feedback depends on θ, its point of linearisation, s and a alone."""
 
-    @known_keywords
     def __init__(
         self,
         problem: Problem,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import gc
 import os
 import re
 import sys
@@ -126,7 +124,7 @@ for panel, function, example in (
 for panel, group, name, *examples in (
     (BUILD, scenario.app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
     (LEARN, study.app, "study", "run mine.toml --out study", "plan mine.toml", "report study"),
-    (LEARN, study.results, "results", "check quick", "update quick", "board results/board"),
+    (LEARN, study.results, "results", "check quick", "update quick", "draw quick"),
     (BUILD, fmu.app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
 ):
     texts = [f"Example: cosim {name} {example}" for example in examples]
@@ -179,9 +177,6 @@ def main() -> None:
     Bad input ends in one line on standard error and exit code 2, an unforeseen error in one line, a
     report with the traceback and exit code 70.
     """
-    # Passes of the collector over modules and CasADi's expressions are a fifth of a short run.
-    gc.set_threshold(100_000)
-    atexit.register(gc.freeze)
     _open_streams()
     warnings.formatwarning = _format_warning
     with command_process():

@@ -62,9 +62,7 @@ class Output:
     def note(self, text: str) -> None:
         """Print a line on standard error, above a bar, unless JSON was asked for."""
         if not self.as_json:
-            tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)  # who may be drawing a bar
-            with tqdm.external_write_mode() if tqdm else nullcontext():
-                print(text, file=sys.stderr)
+            print(text, file=sys.stderr)  # which a bar that is being drawn turns to itself
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print a table, columns of numbers right justified and the others left.

@@ -97,15 +97,13 @@ def _run(
 
     recorder = None
     if record:
-        from cosim.recording import RerunRecorder, spare_pandas
+        from cosim.recording import RerunRecorder
 
         recorder = RerunRecorder(folder / "run.rrd")
     between = recorder.intermediate if recorder else None
     with cosim.FmuPlant(scenario, intermediate=between) as plant:
         law = cosim.build_controller(controller, scenario)
         compile_functions(law, steps)
-        if record:  # a plug-in's own use of pandas stays
-            spare_pandas()
         ended = ""
         try:
             run = cosim.simulate(plant, law, steps, seed, recorder=recorder, progress=progress)

@@ -109,7 +109,8 @@ def report(
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
 
-    Of an unfinished study the finished runs are reported; a stored study may be reported, too.
+    Of an unfinished study the finished runs are reported. A stored study may be reported, too;
+    `cosim results draw` draws the figures of its single runs before.
 
     Args:
         folder: Folder of a study.
@@ -227,7 +228,7 @@ def update(
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
-    """Run studies and store their tables, figures and reports, and the folder's README.
+    """Run studies and store their tables and reports, and the folder's README.
 
     What long studies have finished is kept in the folder's `.work`; run again to go on.
 
@@ -249,14 +250,25 @@ def update(
 
 
 @results.command()
-def board(
-    folder: Annotated[Path, typer.Argument(help="Folder of entries.")] = Path("results/board"),
+def draw(
+    names: NamesArgument = None,
+    folder: Annotated[Path, typer.Option("--results")] = Path("results"),
     json: cli.JsonOption = False,
 ) -> None:
-    """Check a board's entries, play their runs back, and write the board's README.md."""
-    with cli.output(json) as out_:
-        from cosim.studies.board import write_board
+    """Draw the figures of stored studies from their tables, as NAME/figures/*.svg.
 
-        names = write_board(folder)
-        out_.note(f"entries: {', '.join(names)}")
-        out_.json({"entries": names})
+    Figures are not stored. `make docs` draws all of them for the site, some minutes.
+
+    Args:
+        folder: Folder with the studies and tolerances.toml.
+    """
+    with cli.output(json) as out_:
+        from cosim.studies import stored
+
+        studies = stored.stored_studies(folder)
+        kept = [name for name in studies if (folder / name).is_dir()]
+        drawn = {}
+        for name in stored.chosen(studies, names or kept):
+            drawn[name] = stored.draw(folder, name)
+            out_.note(f"{name}: {len(drawn[name])} figures in {folder / name / 'figures'}")
+        out_.json({"figures": drawn})

@@ -13,8 +13,8 @@ from matplotlib.ticker import FormatStrFormatter
 from cosim.figures.style import (
     DASHED,
     REFERENCE,
-    Dots,
-    Look,
+    DotRow,
+    LineStyle,
     dot_rows,
     figure,
     palette,
@@ -38,71 +38,85 @@ def evaluation_figure(
 ) -> Figure:
     """Left: J of each controller; right: economic cost against violation.
 
-    `controllers` have the columns `J`, `economic_cost` and `mean_violation`, a row for each seed.
-    Dots are seeds, bars and large dots means with 95 % t intervals. `optimal` is J* (S,) on the
-    same seeds: the left panel then shows the regret (J − J*)/|J*| in %, paired over the seeds.
-    The grey line joins the controllers that no other one beats in both cost and violation.
+    Dots are seeds, bars and large dots means with 95 % t intervals. The grey line joins the
+    controllers that no other one beats in both cost and violation.
+
+    Args:
+        controllers: columns `J`, `economic_cost` and `mean_violation`, a row for each of S seeds,
+            by the controller's name.
+        title: of the figure.
+        optimal: J* (S,) on the same seeds; the left panel then shows the regret (J − J*)/|J*| in %,
+            paired over the seeds.
     """
-    looks = palette(list(controllers))
+    styles = palette(list(controllers))
     with figure(max(2.8, 0.27 * len(controllers) + 1.3)) as drawn:
         left, right = drawn.subplots(1, 2, width_ratios=(1.0, 1.05))
-        _rows(left, controllers, looks, optimal)
-        _pareto(right, controllers, looks)
+        _draw_costs(left, controllers, styles, optimal)
+        _draw_pareto(right, controllers, styles)
         drawn.suptitle(plain(title))
     return drawn
 
 
-def _rows(
+def _draw_costs(
     axes: Axes,
     controllers: Mapping[str, pd.DataFrame],
-    looks: Mapping[str, Look],
+    styles: Mapping[str, LineStyle],
     optimal: Array | None,
 ) -> None:
+    """A row of dots for each controller: J, or its regret where J* is known."""
     rows = []
     for name, costs in controllers.items():
-        values, scale = costs.J.to_numpy(), 1.0
-        estimate = mean_of(values)
-        if optimal is not None:
-            estimate, scale = regret(values, optimal), 100.0
+        values = costs.J.to_numpy()
+        if optimal is None:
+            scale = 1.0
+            estimate = mean_of(values)
+        else:  # in %
+            scale = 100.0
+            estimate = regret(values, optimal)
             values = 100 * regret_terms(values, optimal)
-        ends = (scale * end for end in estimate.interval or ())
+        low, high = estimate.interval or (np.nan, np.nan)
         finished = np.ones(len(values), dtype=bool)
-        rows.append(Dots(name, values, finished, scale * estimate.value, *ends))
-    values = dot_rows(axes, rows, looks)
+        middle = scale * estimate.value
+        rows.append(DotRow(name, values, finished, middle, scale * low, scale * high))
+    values = dot_rows(axes, rows, styles)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
         regret_axis(axes, "x", np.append(values, 0.0), FLOOR)
         axes.set_xlabel("regret %, 95 % interval")
         return
-    if float(values.min()) > 0 and float(values.max()) > DECADE * float(values.min()):
+    least, most = float(values.min()), float(values.max())
+    if least > 0 and most > DECADE * least:
         axes.set_xscale("log")
     axes.set_xlabel("J per sample, 95 % interval")
 
 
-def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[str, Look]) -> None:
-    means = {
-        name: (float(np.mean(c.mean_violation)), float(np.mean(c.economic_cost)))
-        for name, c in controllers.items()
-    }
-    ends = set(means.values())
-    front = [
-        one for one in sorted(ends)
-        if not any(other != one and np.less_equal(other, one).all() for other in ends)
-    ]  # fmt: skip
+def _draw_pareto(
+    axes: Axes, controllers: Mapping[str, pd.DataFrame], styles: Mapping[str, LineStyle]
+) -> None:
+    """Economic cost against violation of each controller, and the line of the best of both."""
+    means = {}
+    for name, costs in controllers.items():
+        means[name] = (float(np.mean(costs.mean_violation)), float(np.mean(costs.economic_cost)))
+    front = _pareto_front(set(means.values()))
     if len(front) > 1:
         text = "no other is better in both"
         axes.plot(*np.array(front).T, color=REFERENCE, linewidth=0.9, linestyle=DASHED, label=text)
         axes.legend(loc="best")
     for name, costs in controllers.items():
-        color = looks[name].color
+        color = styles[name].color
         axes.plot(
             costs.mean_violation, costs.economic_cost, ".", color=color, ms=3, alpha=0.35, mew=0
         )
         axes.errorbar(
-            *means[name], xerr=_half_width(costs.mean_violation),
-            yerr=_half_width(costs.economic_cost), fmt="o", color=color, markersize=5,
-            capsize=2, linewidth=1.0,
-        )  # fmt: skip
+            *means[name],
+            xerr=_half_width(costs.mean_violation),
+            yerr=_half_width(costs.economic_cost),
+            fmt="o",
+            color=color,
+            markersize=5,
+            capsize=2,
+            linewidth=1.0,
+        )
     top = max(float(costs.mean_violation.max()) for costs in controllers.values())
     if top >= DECADE * VIOLATION:
         axes.set_xscale("symlog", linthresh=VIOLATION, linscale=0.5)
@@ -112,6 +126,20 @@ def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[
     axes.set_ylabel("economic cost per sample")
 
 
+def _pareto_front(points: set[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points that no other one is below in both coordinates, by the first coordinate."""
+    front = []
+    for point in sorted(points):
+        beaten = any(np.less_equal(other, point).all() for other in points - {point})
+        if not beaten:
+            front.append(point)
+    return front
+
+
 def _half_width(values: pd.Series[float]) -> float:
+    """Half of the mean's 95 % interval; 0 of a single value."""
     estimate = mean_of(values.to_numpy())
-    return 0.0 if estimate.interval is None else (estimate.interval[1] - estimate.interval[0]) / 2
+    if estimate.interval is None:
+        return 0.0
+    low, high = estimate.interval
+    return (high - low) / 2

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from colorsys import hls_to_rgb, rgb_to_hls
 from contextlib import contextmanager
-from itertools import cycle, product
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -24,6 +25,8 @@ from cosim.files import write_atomically
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""
+FORMATS = ("svg", "png")
+"""Formats of the figures of a study."""
 FLOOR = 0.01
 """Regret in % below which an axis is linear."""
 
@@ -47,7 +50,7 @@ _LINES: Any = ("-", *((0, dashes) for dashes in _DASHES))
 _STYLE = Path(__file__).with_name("house.mplstyle")
 
 
-class Picture(Figure):
+class StyledFigure(Figure):
     """A figure that a notebook shows without pyplot."""
 
     def _repr_png_(self) -> bytes:
@@ -58,15 +61,29 @@ class Picture(Figure):
 
 @contextmanager
 def figure(height: float, width: float = WIDTH) -> Iterator[Figure]:
-    """A figure of the house style, in inches, without touching the user's own settings."""
+    """A figure of the house style, without touching the user's own settings.
+
+    Args:
+        height: in inches.
+        width: in inches.
+    """
     with mpl.rc_context(fname=_STYLE):
-        yield Picture(figsize=(width, height), layout="constrained")
+        yield StyledFigure(figsize=(width, height), layout="constrained")
 
 
 def save(drawn: Figure, path: str | Path) -> Path:
-    """Write a figure as PNG (200 dpi) or SVG, by the path's suffix; same figure, same bytes.
+    """Write a figure as PNG (200 dpi) or SVG; the same figure gives the same bytes.
 
-    Raises FigureError on another suffix, OSError where the file cannot be written.
+    Args:
+        drawn: the figure.
+        path: of the file; its suffix says the format.
+
+    Returns:
+        The path.
+
+    Raises:
+        FigureError: on another suffix.
+        OSError: if the file cannot be written.
     """
     kind = Path(path).suffix.removeprefix(".")
     if kind not in ("png", "svg"):
@@ -80,50 +97,72 @@ def save(drawn: Figure, path: str | Path) -> Path:
     return write_atomically(path, content.getvalue())
 
 
-def save_set(figures: Iterable[tuple[str, Figure]], folder: Path) -> list[str]:
-    """Write named figures into a folder, each as SVG and as PNG; returns the names."""
+def save_set(
+    figures: Iterable[tuple[str, Figure]], folder: Path, formats: Sequence[str] = FORMATS
+) -> list[str]:
+    """Write named figures into a folder.
+
+    Args:
+        figures: pairs of a name, which is the file's without suffix, and its figure.
+        folder: where they are written; made if it is not there.
+        formats: file suffixes without the dot, `svg` or `png`; a file of each is written.
+
+    Returns:
+        The names, in the order given.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     names = []
     for name, drawn in figures:
         names.append(name)
-        for suffix in ("svg", "png"):
+        for suffix in formats:
             save(drawn, folder / f"{name}.{suffix}")
     return names
 
 
-class Look(NamedTuple):
+class LineStyle(NamedTuple):
     """Colour and line style of a case, the same in every figure of a set."""
 
     color: str
     line: Any
 
 
-def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Look]:
-    """A look for each controller or case, in the order given.
+def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, LineStyle]:
+    """A line style for each controller or case.
 
     Cases of one rule, `rule(start=naive)`, `search+rule` and `rule-simulator`, share a colour and
-    differ in their line style; so do `case-SCENARIO` of several `scenarios`. Known rules have
-    colours of their own, the same in all sets.
+    differ in their line; so do `case-SCENARIO` of several scenarios. Known rules have colours of
+    their own, the same in all sets.
+
+    Args:
+        names: of the cases, in the order of the figures.
+        scenarios: names that a case's may end in.
     """
-    head_of = {name: name.partition("(")[0].removeprefix("search+") for name in names}
-    for name, scenario in product(names, scenarios):
-        head_of[name] = head_of[name].removesuffix(f"-{scenario}")
-    for name, head in head_of.items():
-        rules = [known for known in _KNOWN if f"{head}-".startswith(f"{known}-")]
-        head_of[name] = max(rules, key=len, default=head.removesuffix("-simulator"))
-    heads = dict.fromkeys(head_of.values())
+    endings = [f"-{scenario}" for scenario in scenarios]
+    rules = {name: _rule(name, endings) for name in names}
     others = cycle(_OTHERS)
-    color = {head: _KNOWN.get(head) or next(others) for head in heads}
-    used: dict[str, int] = {}
-    looks = {}
-    for name in names:
-        own = color[head_of[name]]
-        looks[name] = Look(own, _LINES[used.get(own, 0) % len(_LINES)])
-        used[own] = used.get(own, 0) + 1
-    return looks
+    colors: dict[str, str] = {}
+    for rule in rules.values():
+        if rule not in colors:
+            colors[rule] = _KNOWN.get(rule) or next(others)
+    used: Counter[str] = Counter()
+    styles = {}
+    for name, rule in rules.items():
+        color = colors[rule]
+        styles[name] = LineStyle(color, _LINES[used[color] % len(_LINES)])
+        used[color] += 1
+    return styles
 
 
-def lit(color: str) -> str:
+def _rule(name: str, endings: Sequence[str]) -> str:
+    """The rule that a case's name begins with: a known one's name, or all but its settings."""
+    head = name.partition("(")[0].removeprefix("search+")
+    for ending in endings:
+        head = head.removesuffix(ending)
+    known = [rule for rule in _KNOWN if f"{head}-".startswith(f"{rule}-")]
+    return max(known, key=len, default=head.removesuffix("-simulator"))
+
+
+def lighten(color: str) -> str:
     """A colour, lightened where a dark ground would hide it."""
     rgb = to_rgb(color)
     if max(rgb) > 0.55:
@@ -142,8 +181,10 @@ def shown_case(name: str) -> str:
     head, _, settings = name.removesuffix(")").partition("(")
     if settings and "=" not in settings:  # a controller
         return plain(name)
-    values = (word.removeprefix("start=").replace("=", " ") for word in settings.split())
-    return plain(", ".join((head, *values)).replace("_", " "))
+    parts = [head]
+    for setting in settings.split():
+        parts.append(setting.removeprefix("start=").replace("=", " "))
+    return plain(", ".join(parts).replace("_", " "))
 
 
 def symbol(name: str) -> str:
@@ -159,10 +200,17 @@ def symbol(name: str) -> str:
 
 
 def label(name: str, unit: str) -> str:
-    """Axis label `name [unit]`; `X2` prints with its digits as a subscript."""
+    """Axis label `name [unit]`; `X2` prints with its digits as a subscript.
+
+    Args:
+        name: of the signal.
+        unit: as FMI writes it; `1` and nothing are not shown.
+    """
     head = name.rstrip("0123456789")
     digits = name[len(head) :]
-    text = f"${head}_{{{digits}}}$" if digits and head.isalpha() else plain(name.replace("_", " "))
+    text = plain(name.replace("_", " "))
+    if digits and head.isalpha():
+        text = f"${head}_{{{digits}}}$"
     shown = plain({"degC": "°C", "1": ""}.get(unit, unit))
     return f"{text} [{shown}]" if shown else text
 
@@ -170,16 +218,30 @@ def label(name: str, unit: str) -> str:
 def regret_axis(
     axes: Axes, which: Literal["x", "y"], values: NDArray[np.float64], floor: float = FLOOR
 ) -> None:
-    """Scale an axis for regrets in %: logarithmic above `floor`, linear below, J* at zero."""
+    """Scale an axis for regrets: logarithmic above a floor, linear below, J* at zero.
+
+    Args:
+        axes: what is scaled.
+        which: its axis.
+        values: the regrets that it must show, in %, of any shape; not finite ones do not count.
+        floor: in %.
+    """
     finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, floor)
-    lowest = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
-    getattr(axes, f"set_{which}scale")("symlog", linthresh=floor, linscale=0.5)
-    getattr(axes, f"set_{which}lim")(lowest, 1.6 * max(high, floor))
-    (axes.xaxis if which == "x" else axes.yaxis).set_major_formatter(FormatStrFormatter("%g"))
+    low = float(finite.min()) if finite.size else 0.0
+    high = float(finite.max()) if finite.size else floor
+    first = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
+    last = 1.6 * max(high, floor)
+    if which == "x":
+        axes.set_xscale("symlog", linthresh=floor, linscale=0.5)
+        axes.set_xlim(first, last)
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    else:
+        axes.set_yscale("symlog", linthresh=floor, linscale=0.5)
+        axes.set_ylim(first, last)
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
 
 
-class Dots(NamedTuple):
+class DotRow(NamedTuple):
     """Values of a case (K,), whether each finished, and a middle with its interval."""
 
     case: str
@@ -190,25 +252,44 @@ class Dots(NamedTuple):
     high: float = np.nan
 
 
-def dot_rows(axes: Axes, rows: Sequence[Dots], looks: Mapping[str, Look]) -> NDArray[np.float64]:
-    """A row for each case: its values, crosses where one diverged, and their middle; all values."""
-    for row, dots in enumerate(rows):
-        count = len(dots.values)
-        y = row + (np.linspace(-0.18, 0.18, count) if count > 1 else np.zeros(1))
-        for marker, chosen in (("o", dots.finished), ("x", ~dots.finished)):
-            axes.scatter(
-                dots.values[chosen], y[chosen], marker=marker, s=13, alpha=0.55, zorder=3,
-                color=looks[dots.case].color, linewidths=0 if marker == "o" else 0.9,
-            )  # fmt: skip
-        if np.isfinite([dots.low, dots.high]).all():
-            axes.hlines(row, dots.low, dots.high, color=INK, linewidth=1.1, zorder=4)
+def dot_rows(
+    axes: Axes, rows: Sequence[DotRow], styles: Mapping[str, LineStyle]
+) -> NDArray[np.float64]:
+    """Draw a row for each case: its values, crosses where one diverged, their middle, its interval.
+
+    Args:
+        axes: where they are drawn.
+        rows: the cases, from above.
+        styles: line style of each case by its name.
+
+    Returns:
+        The values of all rows, one after the other.
+    """
+    for position, row in enumerate(rows):
+        color = styles[row.case].color
+        single = len(row.values) == 1
+        # Values beside each other are drawn a little above each other.
+        offsets = np.zeros(1) if single else np.linspace(-0.18, 0.18, len(row.values))
+        y = position + offsets
+        dots: Any = {"s": 13, "alpha": 0.55, "zorder": 3, "color": color}
+        lost = ~row.finished
+        axes.scatter(row.values[row.finished], y[row.finished], marker="o", linewidths=0, **dots)
+        axes.scatter(row.values[lost], y[lost], marker="x", linewidths=0.9, **dots)
+        if np.isfinite([row.low, row.high]).all():
+            axes.hlines(position, row.low, row.high, color=INK, linewidth=1.1, zorder=4)
         # A single value lies under its middle, which then has its case's colour.
-        color = INK if count > 1 else looks[dots.case].color
-        axes.vlines(dots.middle, row - 0.3, row + 0.3, color=color, linewidth=1.4, zorder=5)
-    axes.set_yticks(range(len(rows)), [shown_case(dots.case) for dots in rows])
+        axes.vlines(
+            row.middle,
+            position - 0.3,
+            position + 0.3,
+            color=color if single else INK,
+            linewidth=1.4,
+            zorder=5,
+        )
+    axes.set_yticks(range(len(rows)), [shown_case(row.case) for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
-    return np.concatenate([dots.values for dots in rows])
+    return np.concatenate([row.values for row in rows])
 
 
 class EndLabel(NamedTuple):
@@ -226,11 +307,20 @@ def cost_lines(
     *,
     relative: bool,
 ) -> list[EndLabel]:
-    """Draw costs over samples, and levels as dashed lines; their names for `label_ends`.
+    """Draw costs over samples, and levels as dashed lines.
 
-    A line is (name, samples (K,), costs (K,), style); `relative` costs are regrets in %.
+    Args:
+        axes: where they are drawn.
+        lines: name, samples (K,), costs (K,) and style of each line.
+        levels: costs to compare with, by name.
+        relative: whether costs are regrets in %.
+
+    Returns:
+        The names, for `label_ends`: those of the levels, then those of the lines.
     """
-    labels = [EndLabel(shown_case(name), level, REFERENCE) for name, level in levels.items()]
+    labels = []
+    for name, level in levels.items():
+        labels.append(EndLabel(shown_case(name), level, REFERENCE))
     for name, samples, costs, style in lines:
         axes.plot(samples, costs, **style)
         labels.append(EndLabel(shown_case(name), float(costs[-1]), style["color"]))
@@ -242,43 +332,83 @@ def cost_lines(
 
 
 def samples_axis(axes: Axes, end: float, text: str = "") -> None:
-    """Let an abscissa show samples from 0 to `end`."""
+    """Let an abscissa show samples from 0 on.
+
+    Args:
+        axes: what is scaled.
+        end: the last sample.
+        text: label of the axis.
+    """
     axes.set_xlim(0.0, end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel(text)
 
 
 def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]]) -> None:
-    """Write names right of each axes at their lines' ends, pushed apart where they overlap.
+    """Write names right of axes at their lines' ends, pushed apart where they overlap.
 
-    The limits and the scale of the ordinate must be set before.
+    Args:
+        drawn: the figure; limits and scales of the ordinates must be set before.
+        labels: axes, each with its lines' names.
     """
     drawn.draw_without_rendering()
-    for axes, own in labels:
-        height = axes.get_window_extent().height * 72 / axes.figure.dpi
-        low, high = (axes.transData.transform((0, y))[1] for y in axes.get_ylim())
-        ends = np.array([axes.transData.transform((0, item.y))[1] for item in own])
-        wanted = np.clip((ends - low) / (high - low), 0.0, 1.0)
-        order = np.argsort(-wanted, kind="stable")
-        placed = spread(wanted[order], 1.25 * END_SIZE / height) if own else ()
-        for position, index in zip(placed, order, strict=True):
-            item = own[index]
-            arrow: Any = {
-                "arrowstyle": "-", "color": item.color, "linewidth": 0.5, "shrinkB": 0.0,
-                "shrinkA": 0.5, "relpos": (0.0, 0.5),
-            }  # fmt: skip
-            axes.annotate(
-                item.text, xy=(1.0, float(wanted[index])), xytext=(1.035, position),
-                xycoords="axes fraction", textcoords="axes fraction", fontsize=END_SIZE,
-                color=item.color, va="center", ha="left", annotation_clip=False, arrowprops=arrow,
-            )  # fmt: skip
+    for axes, names in labels:
+        if not names:
+            continue
+        ends = np.array([_height(axes, name.y) for name in names])
+        wanted = np.clip(ends, 0.0, 1.0)
+        highest_first = np.argsort(-wanted, kind="stable")
+        points = axes.get_window_extent().height * 72 / axes.figure.dpi
+        placed = spread(wanted[highest_first], gap=1.25 * END_SIZE / points)
+        for position, index in zip(placed, highest_first, strict=True):
+            _label_end(axes, names[index], float(wanted[index]), float(position))
+
+
+def _height(axes: Axes, y: float) -> float:
+    """Where an ordinate lies on the page, as a share of the axes' height."""
+    to_page = axes.transData.transform
+    low, high = axes.get_ylim()
+    bottom, top = to_page((0, low))[1], to_page((0, high))[1]
+    return float((to_page((0, y))[1] - bottom) / (top - bottom))
+
+
+def _label_end(axes: Axes, name: EndLabel, end: float, position: float) -> None:
+    """Write a name at a position, with a line to its line's end; both are shares of the height."""
+    arrow: Any = {
+        "arrowstyle": "-",
+        "color": name.color,
+        "linewidth": 0.5,
+        "shrinkB": 0.0,
+        "shrinkA": 0.5,
+        "relpos": (0.0, 0.5),
+    }
+    axes.annotate(
+        name.text,
+        xy=(1.0, end),
+        xytext=(1.035, position),
+        xycoords="axes fraction",
+        textcoords="axes fraction",
+        fontsize=END_SIZE,
+        color=name.color,
+        va="center",
+        ha="left",
+        annotation_clip=False,
+        arrowprops=arrow,
+    )
 
 
 def spread(positions: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
-    """Descending positions (K,) in [0, 1], moved as little as need be to be `gap` apart.
+    """Move positions apart, as little as need be.
 
-    They minimise the sum of the squared moves, within [0, 1]: an isotonic regression of
+    The sum of the squared moves is least, within [0, 1]: an isotonic regression of
     `positions[i] + i·gap`, clipped. Where K gaps do not fit, the lowest is at 0.
+
+    Args:
+        positions: (K,) in [0, 1], descending.
+        gap: least distance of two.
+
+    Returns:
+        The positions, (K,), at least `gap` apart.
     """
     from scipy.optimize import isotonic_regression  # noqa: PLC0415 - a third of a second
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -48,42 +48,58 @@ def training_figure(
 ) -> Figure:
     """Cost, violation, TD error and θ over a training's samples.
 
-    `log` has columns (K,) of the training's log, NaN where not measured: `samples`, `J` of the
-    training samples since the row before, `greedy_J` and `greedy_violating_share` of the policy,
-    `td_error`; `start` is the greedy J before the first. `theta` maps a block's name to its
-    increments since the start in units of its learning scale, (K, entries). `baselines` are J by
-    controller on the greedy policy's noise; `optimal` is J*, and costs are then
-    shown as regret (J − J*)/|J*|.
+    Args:
+        log: columns (K,) of the training's log, NaN where not measured: `samples`, `J` of the
+            training samples since the row before, `greedy_J` and `greedy_violating_share` of the
+            policy, `td_error`.
+        theta: a block's increments since the start in units of its learning scale, (K, entries), by
+            its name.
+        baselines: J by controller on the greedy policy's noise; `optimal` is J*, and costs are then
+            shown as regret (J − J*)/|J*|.
+        title: of the figure.
+        start: greedy J before the first sample, NaN where not measured.
     """
     best = baselines.get("optimal")
-    norms = {name: np.linalg.norm(values, axis=1) for name, values in theta.items()}
-    order = sorted((n for n in norms if norms[n].any()), key=lambda n: -float(norms[n][-1]))
-    panels = ["regret %" if best is not None else "J per sample"]
     share, error = _known(log, "greedy_violating_share"), _known(log, "td_error")
-    panels += ["greedy: violating samples %"] * bool(share[0].size)
-    panels += ["TD error (r.m.s.)"] * (error[0].size > 1)  # a single one makes no curve
-    panels += ["change of θ, by its scale"] * bool(order)
+    moved = _most_moved(theta)
+    panels: dict[str, Callable[[Axes], Sequence[EndLabel]]] = {
+        "regret %" if best is not None else "J per sample": lambda axes: _cost(
+            axes, log, start, baselines, best
+        )
+    }
+    if share[0].size:
+        panels["greedy: violating samples %"] = lambda axes: _course(
+            axes, share[0], 100 * share[1], GREEDY, least=1.0
+        )
+    if error[0].size > 1:  # a single one makes no curve
+        panels["TD error (r.m.s.)"] = lambda axes: _course(axes, *error, INK, least=1e-12)
+    if moved:
+        panels["change of θ, by its scale"] = lambda axes: _change(axes, log, moved)
     columns = len(panels) if len(panels) < 4 else 2
     rows = -(-len(panels) // columns)
     with figure(2.15 * rows + 0.35) as drawn:
         grid = drawn.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-        named = []
-        for axes, name in zip(grid, panels, strict=True):
-            if name.startswith("greedy"):
-                _course(axes, share[0], 100 * share[1], GREEDY, 1.0)
-            elif name.startswith("TD"):
-                _course(axes, *error, INK, 1e-12)
-            elif name.startswith("change"):
-                named.append((axes, _change(axes, log, {n: norms[n] for n in order[:BLOCKS]})))
-            else:
-                named.append((axes, _cost(axes, log, start, baselines, best)))
+        labels = []
+        for axes, (name, draw) in zip(grid, panels.items(), strict=True):
+            labels.append((axes, draw(axes)))
             axes.set_title(name, loc="left", fontsize=8.0)
             samples_axis(axes, max(float(log["samples"][-1]), 1.0))
         for axes in grid[-columns:]:
             axes.set_xlabel("training samples")
         drawn.suptitle(plain(title))
-        label_ends(drawn, named)
+        label_ends(drawn, labels)
     return drawn
+
+
+def _most_moved(theta: Mapping[str, Array]) -> dict[str, Array]:
+    """Norm of the increments (K,) of the blocks that moved most, the farthest first."""
+    norms = {}
+    for name, increments in theta.items():
+        norm = np.linalg.norm(increments, axis=1)
+        if norm.any():
+            norms[name] = norm
+    names = sorted(norms, key=lambda name: -float(norms[name][-1]))
+    return {name: norms[name] for name in names[:BLOCKS]}
 
 
 def _known(log: Mapping[str, Array], name: str) -> tuple[Array, Array]:
@@ -100,41 +116,50 @@ def _cost(
     baselines: Mapping[str, float],
     best: float | None,
 ) -> list[EndLabel]:
+    """Cost of the training samples and of the greedy policy, as regret where J* is known."""
+
     def shown(cost: Array | float) -> Array:
         values = np.asarray(cost, dtype=np.float64)
         return values if best is None else 100 * regrets(values, best)
 
     lines = []
-    for name, color, text in (("J", INK, "training"), ("greedy_J", GREEDY, "greedy")):
-        samples, cost = _known(log, name)
-        if name == "greedy_J" and np.isfinite(start):
-            samples, cost = np.append(0.0, samples), np.append(start, cost)
-        if cost.size:
-            marker = "o" if name == "greedy_J" else ""
-            lines.append((text, samples, shown(cost), _LINE | {"marker": marker, "color": color}))
+    samples, cost = _known(log, "J")
+    if cost.size:
+        lines.append(("training", samples, shown(cost), _LINE | {"marker": "", "color": INK}))
+    samples, cost = _known(log, "greedy_J")
+    if np.isfinite(start):
+        samples, cost = np.append(0.0, samples), np.append(start, cost)
+    if cost.size:
+        lines.append(("greedy", samples, shown(cost), _LINE | {"marker": "o", "color": GREEDY}))
     levels = {name: float(shown(level)) for name, level in baselines.items()}
     return cost_lines(axes, lines, levels, relative=best is not None)
 
 
-def _course(axes: Axes, samples: Array, values: Array, color: str, least: float) -> None:
-    """A line from 0 to `least` or more, logarithmic where it spans decades."""
+def _course(
+    axes: Axes, samples: Array, values: Array, color: str, least: float
+) -> Sequence[EndLabel]:
+    """A line from 0 to `least` or more, logarithmic where it spans decades; it has no name."""
     axes.plot(samples, values, marker="." if len(values) < POINTS else "", color=color, **_LINE)
-    low, top = float(values.min()), max(float(values.max()), least)
+    low = float(values.min())
+    top = max(float(values.max()), least)
     short = EngFormatter(sep="") if top >= 1e3 else FormatStrFormatter("%g")
     axes.yaxis.set_major_formatter(short)
     if 0 < DECADES * low < top:
         axes.set_yscale("log")
     else:
         axes.set_ylim(-0.04 * top, 1.1 * top)
+    return ()
 
 
 def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) -> list[EndLabel]:
+    """Norm of the increments of blocks of θ, each (K,), from zero at the start."""
     samples = np.append(0.0, log["samples"])
     labels = []
+    top = 0.0
     for color, (name, norm) in zip(ENTRIES, moved.items(), strict=False):
         axes.plot(samples, np.append(0.0, norm), color=color, linewidth=1.2)
         labels.append(EndLabel(symbol(name), float(norm[-1]), color))
-    top = max(float(norm.max()) for norm in moved.values())
+        top = max(top, float(norm.max()))
     if top > DECADES:
         axes.set_yscale("symlog", linthresh=1.0)
         axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
@@ -145,11 +170,18 @@ def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) ->
 def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error: Array) -> Figure:
     """The paper's figure of a training: increments of θ by block, and the TD error.
 
-    `increments` maps a block's name to θ − θ₀ (K, entries) at `samples` (K,); `td_error` (K,) is
-    the root mean square over the preceding `TD_WINDOW` samples. Source: paper.tex, fig. nmpc_learn.
+    Source: paper.tex, fig. nmpc_learn.
+
+    Args:
+        samples: of the training, (K,).
+        increments: θ − θ₀ of each block by its name, (K, entries).
+        td_error: root mean square over the preceding `TD_WINDOW` samples, (K,).
     """
     moving = {name: values for name, values in increments.items() if np.any(values)}
-    looks = [{"linestyle": line, "color": color} for line, color in product(("-", DASHED), ENTRIES)]
+    # Of the entries of a block, in turn: solid in every colour, then dashed.
+    styles = []
+    for line, color in product(("-", DASHED), ENTRIES):
+        styles.append({"linestyle": line, "color": color})
     columns = 4
     rows = -(-len(moving) // columns)
     with figure(1.3 * rows + 2.2) as drawn:
@@ -159,8 +191,9 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
             axes = drawn.add_subplot(grid[i // columns, i % columns], sharex=first)
             first = first or axes
             for k, entry in enumerate(values.T):
-                axes.plot(samples, entry, linewidth=0.8, **looks[k % len(looks)])
+                axes.plot(samples, entry, linewidth=0.8, **styles[k % len(styles)])
             axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
+            # Samples stand below the lowest panel of each column.
             axes.tick_params(labelbottom=i + columns >= len(moving))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
@@ -171,8 +204,9 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
         axes.set_title(title, loc="left", fontsize=8.0)
         most = max((values.shape[1] for values in moving.values()), default=0)
         if most:
-            shown = enumerate(looks[:most], 1)
-            handles = [Line2D([], [], linewidth=1.2, label=str(k), **look) for k, look in shown]
+            handles = []
+            for entry_number, style in enumerate(styles[:most], start=1):
+                handles.append(Line2D([], [], linewidth=1.2, label=str(entry_number), **style))
             title = "entry of its block, in the block's own unit"
             drawn.legend(handles=handles, loc="outside lower center", ncols=12, title=title)
     return drawn

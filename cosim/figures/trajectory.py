@@ -42,62 +42,88 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
 
     States and inputs have the controller's colour; inputs, disturbances and costs hold from one
     sample to the next. Violated bounds are shaded, fallback actions marked; a bound far from the
-    data is named, not drawn. The axes span the runs `beside` this one too, so that figures of a
-    set can be compared.
+    data is named, not drawn.
+
+    Args:
+        trajectory: the run.
+        scenario: its scenario.
+        beside: other runs that the axes span too, so that figures of a set can be compared.
     """
-    units = {name: signal.unit for name, signal in trajectory.signals.items()}
     scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
-    who = trajectory.controller or "run"
-    color = palette([who])[who].color
-    held, costs = scenario.plant.disturbances, {"stage_cost": REFERENCE, "penalty": BOUND}
-    left, right = [*scenario.limits], [*held, *costs]
+    costs = {"stage_cost": REFERENCE, "penalty": BOUND}
+    left = [*scenario.limits]
+    right = [*scenario.plant.disturbances, *costs]
+    # The columns have as many rows as both numbers of panels divide.
     rows = int(np.lcm(len(left), len(right)))
-    cells: Any = [
-        [names[row * len(names) // rows] for names in (left, right)] for row in range(rows)
-    ]
-    references = np.append(scenario.reference_state, scenario.reference_action)
-    failed = trajectory["failed"] > 0
+    cells: Any = []
+    for row in range(rows):
+        cells.append([names[row * len(names) // rows] for names in (left, right)])
     with figure(max(1.05 * max(len(left), len(right) * 0.8), 2.4) + 0.5) as drawn:
         panels = drawn.subplot_mosaic(cells, sharex=True, width_ratios=(1.35, 1.0))
         for name, axes in panels.items():
-            axes.set_ylabel(label(name, units[name]), fontsize=7.0)
+            axes.set_ylabel(label(name, trajectory.signals[name].unit), fontsize=7.0)
             for run in beside:
                 values = run[name]
                 axes.update_datalim([(time[0], np.min(values)), (time[0], np.max(values))])
                 axes.autoscale_view()
-        for name, reference in zip(left, references, strict=True):
-            axes, values = panels[name], trajectory[name]
-            _line(axes, time, trajectory, name, BOUND, color=color, linewidth=0.9)
-            _limits(axes, *scenario.limits[name])
-            axes.axhline(reference, color=REFERENCE, linewidth=0.7)
-            if name in scenario.plant.actions and failed.any():
-                axes.plot(time[failed], values[failed], "x", color=BOUND, ms=4, label="fallback")
-                axes.legend(loc="upper right")
+        _loop_panels(panels, time, trajectory, scenario)
         for name in right:
-            shade = costs.get(name, REFERENCE)
-            panels[name].step(time, trajectory[name], where="post", color=shade, linewidth=0.6)
+            color = costs.get(name, REFERENCE)
+            panels[name].step(time, trajectory[name], where="post", color=color, linewidth=0.6)
         for name in costs:
-            mean = float(np.mean(trajectory[name]))
-            panels[name].axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
-            panels[name].annotate(
-                f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
-                (0.99, 0.95), xycoords="axes fraction", ha="right", va="top", fontsize=6.5,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
-            )  # fmt: skip
+            _mean(panels[name], float(np.mean(trajectory[name])))
         panels["penalty"].set_ylim(bottom=0.0)
         for names in (left, right):
             panels[names[-1]].set_xlabel(f"time [{unit}]")
-        panels[left[0]].set_xlim(time[0], time[-1] + (time[1] - time[0] if len(time) > 1 else 1.0))
+        last_step = time[1] - time[0] if len(time) > 1 else 1.0
+        panels[left[0]].set_xlim(time[0], time[-1] + last_step)
         drawn.align_ylabels()
-        summary = trajectory.summary()
-        seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
-        drawn.suptitle(
-            f"{shown_case(who)} on {plain(scenario.name)}{seed}:   "
-            f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
-            f"violating {100 * summary['violating_share']:.1f} % of samples"
-        )
+        drawn.suptitle(_title(trajectory, scenario))
     return drawn
+
+
+def _loop_panels(
+    panels: Mapping[str, Axes], time: Array, trajectory: Run, scenario: Scenario
+) -> None:
+    """Draw states and inputs, their bounds and operating point, and fallback actions."""
+    controller = trajectory.controller or "run"
+    color = palette([controller])[controller].color
+    references = np.append(scenario.reference_state, scenario.reference_action)
+    failed = trajectory["failed"] > 0
+    for name, reference in zip(scenario.limits, references, strict=True):
+        axes = panels[name]
+        _line(axes, time, trajectory, name, color, width=0.9, shade=BOUND)
+        _limits(axes, *scenario.limits[name])
+        axes.axhline(reference, color=REFERENCE, linewidth=0.7)
+        if name in scenario.plant.actions and failed.any():
+            values = trajectory[name][failed]
+            axes.plot(time[failed], values, "x", color=BOUND, ms=4, label="fallback")
+            axes.legend(loc="upper right")
+
+
+def _mean(axes: Axes, mean: float) -> None:
+    """Draw a mean as a dotted line, and its number in the corner."""
+    axes.axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
+    axes.annotate(
+        f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
+        (0.99, 0.95),
+        xycoords="axes fraction",
+        ha="right",
+        va="top",
+        fontsize=6.5,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
+    )
+
+
+def _title(trajectory: Run, scenario: Scenario) -> str:
+    summary = trajectory.summary()
+    seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
+    return (
+        f"{shown_case(trajectory.controller or 'run')} on {plain(scenario.name)}{seed}:   "
+        f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
+        f"violating {100 * summary['violating_share']:.1f} % of samples"
+    )
 
 
 def overlay_figure(runs: Mapping[str, Run]) -> Figure:
@@ -109,33 +135,45 @@ def overlay_figure(runs: Mapping[str, Run]) -> Figure:
     first = next(iter(runs.values()))
     scenario = first.scenario
     scale, unit = time_unit(first.time)
-    looks = palette(list(runs))
+    styles = palette(list(runs))
     with figure(1.2 * len(scenario.limits) + 0.6) as drawn:
         rows = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
         for axes, name in zip(rows, scenario.limits, strict=True):
             for controller, run in runs.items():
-                color = looks[controller].color
-                _line(axes, run.time / scale, run, name, color, color=color, linewidth=1.1)
+                color = styles[controller].color
+                _line(axes, run.time / scale, run, name, color, width=1.1, shade=color)
             _limits(axes, *scenario.limits[name])
             axes.set_ylabel(label(name, first.signals[name].unit))
+        end = first.time[-1] + scenario.sampling_time
         rows[-1].set_xlabel(f"time [{unit}]")
-        rows[-1].set_xlim(first.time[0] / scale, (first.time[-1] + scenario.sampling_time) / scale)
+        rows[-1].set_xlim(first.time[0] / scale, end / scale)
         drawn.align_ylabels()
         for controller, run in runs.items():
             summary = run.summary()
             violating = f"{100 * summary['violating_share']:.0f} % of samples violate"
             text = f"{shown_case(controller)}: J = {summary['J']:.0f}, {violating}"
-            rows[0].plot([], [], color=looks[controller].color, label=text)
+            rows[0].plot([], [], color=styles[controller].color, label=text)
         rows[0].plot([], [], color=BOUND, linestyle=DASHED, label="bound")
         rows[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.2)
     return drawn
 
 
 def animation(start: str, first: Run, name: str, runs: Mapping[str, Run], path: str | Path) -> Path:
-    """Write a GIF: a frame for each of `runs`, by title, drawn over the `first` on the same axes.
+    """Write a GIF: a frame for each run, drawn over the first one on the same axes.
 
-    `start` and `name` are the legend's names of the first and the others. Raises FigureError on
-    another suffix, OSError where the file cannot be written.
+    Args:
+        start: the first run's name in the legend.
+        first: the run that every frame has.
+        name: the others' name in the legend.
+        runs: a run for each frame, by the frame's title.
+        path: of the file, which must end in .gif.
+
+    Returns:
+        The path.
+
+    Raises:
+        FigureError: on another suffix.
+        OSError: if the file cannot be written.
     """
     if Path(path).suffix != ".gif":
         raise FigureError(f"cannot draw '{path}': the file must end in .gif")
@@ -143,44 +181,59 @@ def animation(start: str, first: Run, name: str, runs: Mapping[str, Run], path: 
     for title, run in runs.items():
         drawn = overlay_figure({start: first, name: run})
         for axes, signal in zip(drawn.axes, first.scenario.limits, strict=True):
-            values = np.concatenate([one[signal] for one in (first, *runs.values())])
-            margin = 0.05 * float(np.ptp(values)) or 1.0
-            low, high = axes.set_ylim(values.min() - margin, values.max() + margin)
-            for text in axes.texts:
-                if isinstance(text, Annotation) and isinstance(text.xycoords, tuple):
-                    text.set_visible(low <= text.xy[1] <= high)  # a bound in sight
+            values = np.concatenate([first[signal], *(frame[signal] for frame in runs.values())])
+            _fix_ordinate(axes, values)
         drawn.axes[0].set_title(title, loc="right", fontsize=8.5, pad=16.0)
         images.append(Image.fromarray(_pixels(drawn)))
+    durations = [FRAME] * len(images)
+    durations[-1] = 6 * FRAME
     content = BytesIO()
     images[0].save(
-        content, "GIF", save_all=True, append_images=images[1:], loop=0,
-        duration=[*[FRAME] * (len(images) - 1), 6 * FRAME],
-    )  # fmt: skip
+        content, "GIF", save_all=True, append_images=images[1:], loop=0, duration=durations
+    )
     return write_atomically(path, content.getvalue())
+
+
+def _fix_ordinate(axes: Axes, values: Array) -> None:
+    """Show these values with a margin, and the names of those bounds that are in sight."""
+    margin = 0.05 * float(np.ptp(values)) or 1.0
+    low, high = axes.set_ylim(values.min() - margin, values.max() + margin)
+    for text in axes.texts:
+        if isinstance(text, Annotation) and isinstance(text.xycoords, tuple):
+            text.set_visible(low <= text.xy[1] <= high)
 
 
 def episode_image(
     scenario: Scenario, units: dict[str, str], first: int, states: Array, actions: Array
 ) -> NDArray[np.uint8]:
-    """An RGB image (height, width, 3) of an episode's last samples, from sample `first` on.
+    """An RGB image of an episode's last samples.
 
-    `states` (K+1, n), `actions` (K, m) between them; `units` maps variables' names to their units.
+    Args:
+        scenario: of the episode.
+        units: of the states and actions, by name.
+        first: number of the first sample shown.
+        states: (K+1, n).
+        actions: (K, m), between the states.
+
+    Returns:
+        The image, (height, width, 3).
     """
     plant = scenario.plant
-    seconds: Array = scenario.sampling_time * np.arange(first, first + len(states), dtype=float)
+    samples = np.arange(first, first + len(states), dtype=float)
+    seconds: Array = scenario.sampling_time * samples
     scale, unit = time_unit(seconds)
     time = seconds / scale
     names = [*plant.states, *plant.actions]
     with figure(1.3 * len(names), 6.0) as drawn:
         panels = drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        for i in range(len(plant.states)):
-            panels[i].plot(time, states[:, i], color=INK)
-            _limits(panels[i], scenario.state_lower[i], scenario.state_upper[i])
+        for name, panel in zip(names, panels, strict=True):
+            panel.set_ylabel(label(name, units[name]))
+        for i, panel in enumerate(panels[: len(plant.states)]):
+            panel.plot(time, states[:, i], color=INK)
+            _limits(panel, scenario.state_lower[i], scenario.state_upper[i])
         for j, panel in enumerate(panels[len(plant.states) :]):
             panel.stairs(actions[:, j], time, color=INK, baseline=None)
             _limits(panel, scenario.action_lower[j], scenario.action_upper[j])
-        for panel, name in zip(panels, names, strict=True):
-            panel.set_ylabel(label(name, units[name]))
         panels[-1].set_xlabel(f"time [{unit}]")
         panels[-1].set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1.0)
         drawn.align_ylabels()
@@ -201,17 +254,27 @@ def time_unit(time: Array) -> tuple[float, str]:
     return (60.0, "min") if duration <= 86400.0 else (3600.0, "h")
 
 
-def _line(axes: Axes, time: Array, run: Run, name: str, shade: str, **look: Any) -> None:
+def _line(
+    axes: Axes, time: Array, run: Run, name: str, color: str, width: float, shade: str
+) -> None:
     """Draw a state, or an input, which is held, and shade what is beyond its bounds."""
-    values, (lower, upper) = run[name], run.scenario.limits[name]
+    values = run[name]
+    lower, upper = run.scenario.limits[name]
     held = "steps-post" if name in run.scenario.plant.actions else "default"
-    axes.plot(time, values, drawstyle=held, **look)
+    axes.plot(time, values, drawstyle=held, color=color, linewidth=width)
     for bound, outside in ((lower, values < lower), (upper, values > upper)):
-        if outside.any():
-            axes.fill_between(
-                time, values, bound, where=list(outside), color=shade, alpha=0.3, linewidth=0,
-                interpolate=True,
-            )  # fmt: skip
+        if not outside.any():
+            continue
+        axes.fill_between(
+            time,
+            values,
+            bound,
+            where=list(outside),
+            color=shade,
+            alpha=0.3,
+            linewidth=0,
+            interpolate=True,
+        )
 
 
 def _limits(axes: Axes, lower: float, upper: float) -> None:
@@ -219,18 +282,31 @@ def _limits(axes: Axes, lower: float, upper: float) -> None:
     low, high = axes.dataLim.intervaly
     span = max(high - low, 1e-9)
     far = []
-    for name, bound, distance in (("≥", lower, low - lower), ("≤", upper, upper - high)):
+    for sign, bound, distance in (("≥", lower, low - lower), ("≤", upper, upper - high)):
+        text = f"{sign} {bound:g}"
         if distance >= span:
-            far.append(f"{name} {bound:g}")
+            far.append(text)
             continue
         axes.axhline(bound, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
         # Right of the axes: within, the data would hide it.
         axes.annotate(
-            f"{name} {bound:g}", (1.0, bound), xycoords=("axes fraction", "data"), xytext=(3, 0),
-            textcoords="offset points", ha="left", va="center", fontsize=6.5, color=BOUND,
-        )  # fmt: skip
+            text,
+            (1.0, bound),
+            xycoords=("axes fraction", "data"),
+            xytext=(3, 0),
+            textcoords="offset points",
+            ha="left",
+            va="center",
+            fontsize=6.5,
+            color=BOUND,
+        )
     if far:
         axes.annotate(
-            f"bound {', '.join(far)}", (1.0, 1.0), xycoords="axes fraction", ha="right",
-            va="bottom", fontsize=6.5, color=BOUND,
-        )  # fmt: skip
+            f"bound {', '.join(far)}",
+            (1.0, 1.0),
+            xycoords="axes fraction",
+            ha="right",
+            va="bottom",
+            fontsize=6.5,
+            color=BOUND,
+        )

@@ -18,7 +18,6 @@ from cosim.plant.probe import Restart, as_asked, probe_of, subject_of
 from cosim.plant.wiring import Wiring, refusals, seed_words
 from cosim.protocols import Array, CompiledLoop, Step
 from cosim.scenario import Scenario
-from cosim.validation import known_keywords
 
 _NOT_STARTED = -1
 _HEADER = struct.Struct("<q32s")
@@ -56,7 +55,6 @@ class FmuPlant:
     scenario names; CapabilityError once a capability that the FMU lacks is used.
     """
 
-    @known_keywords
     def __init__(
         self,
         scenario: Scenario | str | Path,

@@ -2,7 +2,7 @@
 
 from cosim.recording.read import Recording, read_recording, summarise
 from cosim.recording.viewer import open_viewer, render
-from cosim.recording.write import RerunRecorder, record_overlay, record_training, spare_pandas
+from cosim.recording.write import RerunRecorder, record_overlay, record_training
 
 __all__ = [
     "Recording",
@@ -12,6 +12,5 @@ __all__ = [
     "record_overlay",
     "record_training",
     "render",
-    "spare_pandas",
     "summarise",
 ]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,36 +61,49 @@ def read_recording(path: str | Path) -> Recording:
             static.setdefault(chunk.entity_path, {}).update(texts)
         elif SAMPLE in batch.schema.names:
             batches[chunk.entity_path].append(batch)
-    rows = {entity: _rows(parts) for entity, parts in batches.items()}
-    marks = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
-    if not marks:
+    rows_of = {entity: _rows(parts) for entity, parts in batches.items()}
+    recording = Recording({}, np.empty(0, np.int64), np.empty(0), {}, _properties(static), [], {})
+    marked = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
+    if not marked:
         raise RecordingError(f"{path} holds no signals of rti-cosim")
     signals: dict[str, NDArray[np.float64]] = {}
-    units: dict[str, str] = {}
-    intermediate: dict[str, NDArray[np.float64]] = {}
-    samples, time = np.empty(0, np.int64), np.empty(0)
-    for entity, texts in marks.items():
-        names, spelled = texts[f"{SIGNAL}:name"], texts.get(f"{SIGNAL}:unit", [])
-        if len(names) != len(spelled):
+    samples, time = recording.samples, recording.time
+    for entity, texts in marked.items():
+        names = texts[f"{SIGNAL}:name"]
+        units = texts.get(f"{SIGNAL}:unit", [])
+        if len(names) != len(units):
             raise RecordingError(f"{path} was recorded by another version of rti-cosim")
-        units |= dict(zip(names, spelled, strict=True))
-        if entity not in rows:
+        recording.units.update(zip(names, units, strict=True))
+        rows = rows_of.get(entity)
+        if rows is None:
             signals |= dict.fromkeys(names, np.empty(0))
             continue
-        values, moments = _values(rows[entity], len(names)), _time(rows[entity])
+        values = _values(rows, len(names))
+        moments = _time(rows)
         if entity.startswith("/intermediate/"):
             order = moments.argsort(kind="stable")
-            intermediate[names[0]] = np.column_stack([moments, *values])[order]
+            recording.intermediate[names[0]] = np.column_stack([moments, *values])[order]
             continue
         signals |= dict(zip(names, values, strict=True))
-        if len(rows[entity]) > len(samples):
-            samples, time = np.asarray(rows[entity][SAMPLE]), moments
-    described = next((t for e, t in static.items() if e.endswith("/run")), {})
-    properties = {key: text[0] for key, text in described.items() if ":" not in key and text}
-    properties.pop("rerun.controls.RowId", None)
-    status = _status(rows[STATUS], samples) if STATUS in rows else []
-    signals = dict(sorted(signals.items()))
-    return Recording(signals, samples, time, units, properties, status, intermediate)
+        if len(rows) > len(samples):
+            samples, time = np.asarray(rows[SAMPLE]), moments
+    status = _status(rows_of[STATUS], samples) if STATUS in rows_of else []
+    in_order = dict(sorted(signals.items()))
+    return replace(recording, signals=in_order, samples=samples, time=time, status=status)
+
+
+def _properties(static: Mapping[str, Mapping[str, list[str]]]) -> dict[str, str]:
+    """The run's properties, from the static texts of each entity."""
+    properties = {}
+    for entity, texts in static.items():
+        if not entity.endswith("/run"):
+            continue
+        for key, text in texts.items():
+            internal = ":" in key or key == "rerun.controls.RowId"
+            if text and not internal:
+                properties[key] = text[0]
+        break
+    return properties
 
 
 def worst_moment(path: str | Path) -> float | None:
@@ -115,8 +129,11 @@ def summarise(path: str | Path) -> dict[str, Any]:
     signals = {}
     for name, values in recording.signals.items():
         finite = values[np.isfinite(values)]
-        low, high = (float(finite.min()), float(finite.max())) if finite.size else (None, None)
-        signals[name] = {"unit": recording.units[name], "minimum": low, "maximum": high}
+        signals[name] = {
+            "unit": recording.units[name],
+            "minimum": float(finite.min()) if finite.size else None,
+            "maximum": float(finite.max()) if finite.size else None,
+        }
     return {
         "properties": recording.properties,
         "samples": len(recording.samples),
@@ -161,8 +178,9 @@ def _rows(batches: list[pa.RecordBatch]) -> pa.Table:
 def _values(rows: pa.Table, signals: int) -> list[NDArray[np.float64]]:
     """For each signal of a bundle its values, (K,) or (K, N)."""
     flat = pc.list_flatten(rows[_SCALARS]).to_numpy()
-    parts = np.ascontiguousarray(flat.reshape(len(rows), signals, -1).swapaxes(0, 1))
-    return [part[:, 0] if part.shape[1] == 1 else part for part in parts]
+    # A row has the numbers of the first signal, then those of the next.
+    by_signal = np.ascontiguousarray(flat.reshape(len(rows), signals, -1).swapaxes(0, 1))
+    return [values[:, 0] if values.shape[1] == 1 else values for values in by_signal]
 
 
 def _time(rows: pa.Table) -> NDArray[np.float64]:

@@ -48,13 +48,20 @@ def render(
     size: tuple[int, int] = (1920, 1080),
     timeout: float = 60.0,
 ) -> None:
-    """Draw a recording to a PNG without a screen, with the time cursor at `at`.
+    """Draw a recording to a PNG without a screen.
 
-    `at` is in seconds of the run, or a sample's number where there is no time (a training); default
-    is the worst violation of a run, or the end.
+    Args:
+        path: of the recording.
+        png: path of the picture.
+        at: where the time cursor stands, in s of the run, or a sample's number where there is no
+            time (a training); by default at the worst violation of a run, or its end.
+        size: width and height in pixels.
+        timeout: in s.
 
-    Raises RecordingError where there is no such file or graphics driver, where a view failed or
-    `timeout` s have passed, OSError where the PNG cannot be written.
+    Raises:
+        RecordingError: if there is no such file or graphics driver, a view failed or the time was
+            not enough.
+        OSError: if the PNG cannot be written.
     """
     if at is not None and not isfinite(at):
         raise RecordingError(f"the time of the cursor (--at) must be finite, not {at}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import os
 import secrets
-import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +17,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
-import pyarrow
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 from rerun import escape_entity_path_part as escaped
 
 from cosim.comparison import RunSignals
@@ -77,22 +76,29 @@ class RerunRecorder:
         steps: int,
         units: dict[str, str],
     ) -> None:
-        """Open the file; write layout and properties."""
+        """Open the file; write layout and properties.
+
+        Args:
+            scenario: of the run.
+            controller: of the run; its name and the hash of its θ are properties.
+            seed: of the disturbances.
+            steps: samples of the whole run, for the time axis.
+            units: unit of each FMU variable by name.
+        """
         name = controller_name(controller)
         self._seconds = steps * scenario.sampling_time
-        recorded = [kind for kind in SIGNALS if kind.group is not None]
-        self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
-        self._predicted = {
-            f"predicted_{group}": [
-                Channel(f"prediction/{escaped(c.name)}", f"prediction/{c.name}", c.unit)
-                for c in self._group(group)
-            ]
-            for group in ("states", "actions")
-        }
-        self._fine = [
-            replace(c, entity=f"intermediate/{escaped(c.name)}", color=color, labels=["within"])
-            for c, color in zip(self._group("states"), cycle(SERIES[2:]), strict=False)
-        ]
+        self._kinds = {}
+        for kind in SIGNALS:
+            if kind.group is not None:
+                self._kinds[kind] = _channels(kind, scenario, units)
+        self._predicted = {}
+        for group in ("states", "actions"):
+            channels = [_predicted_channel(channel) for channel in self._group(group)]
+            self._predicted[f"predicted_{group}"] = channels
+        self._fine = []
+        for channel, color in zip(self._group("states"), cycle(SERIES[2:]), strict=False):
+            entity = f"intermediate/{escaped(channel.name)}"
+            self._fine.append(replace(channel, entity=entity, color=color, labels=["within"]))
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
         self._status: str | None = None
         properties = {
@@ -108,48 +114,89 @@ class RerunRecorder:
         }
         title = f"{name} on {scenario.name}, seed {seed}"
         about = _about(scenario, properties)
-        stream = self._stream = Stream(self.path, title, about, properties, self._layout())
-        good = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
-        stream.rerun.log(_STATUS, good, static=True)
+        self._stream = Stream(self.path, title, about, properties, self._layout())
+        solved = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
+        self._stream.rerun.log(_STATUS, solved, static=True)
 
     def record(self, first: int, columns: Mapping[str, Array], status: Sequence[str]) -> None:
-        """Append K samples: one column of K rows for each signal."""
+        """Append K samples: one column of K rows for each signal.
+
+        Args:
+            first: number of the first sample.
+            columns: values by the names of `SIGNALS`, (K,), or (K, n) of a vector, and predictions,
+                (K, N+1 or N, n).
+            status: the solver's status of each sample.
+        """
         stream = self._stream
         if stream is None:
             return
-        samples, time = np.arange(first, first + len(status)), columns["time"]
-        rows, ends = times(samples, time), times(samples[[0, -1]], time[[0, -1]])
-        bundles: dict[str, list[tuple[Channel, Array]]] = {}
-        for kind, channels in self._kinds.items():
-            own = columns[kind.name].reshape(len(status), -1).T
-            for channel, values in zip(channels, own, strict=True):
-                bundles.setdefault(channel.entity, []).append((channel, values))
-        for bundle in bundles.values():
-            members, parts = zip(*bundle, strict=True)
-            stream.send(members, rows, np.column_stack(parts), ends)
+        time = columns["time"]
+        samples = np.arange(first, first + len(status))
+        rows = times(samples, time)
+        self._record_signals(stream, columns, rows, times(samples[[0, -1]], time[[0, -1]]))
         with np.errstate(divide="ignore", invalid="ignore"):
             residual = np.log10(columns["residual"])
         stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
         self._residual.see(residual)
-        before, self._status = [self._status, *status[:-1]], status[-1]
-        if changes := [i for i, word in enumerate(status) if word != before[i]]:
-            states = rr.StateChange.columns(state=[drawable(status[i]) for i in changes])
-            stream.rerun.send_columns(_STATUS, times(samples[changes], time[changes]), states)
+        self._record_status(stream, samples, time, status)
         for name, channels in self._predicted.items():
-            stages: Any = np.moveaxis(columns[name], 2, 0) if name in columns else []
-            for channel, values in zip(channels, stages, strict=False):
+            if name not in columns:
+                continue
+            for channel, values in zip(channels, np.moveaxis(columns[name], 2, 0), strict=False):
                 channel.labels = [f"+{stage}" for stage in range(values.shape[1])]
                 stream.send([channel], rows, values)
-        if self._within:
-            moments, *within = np.array(self._within).T
-            self._within.clear()
-            # A state at the end of a sample counts to that sample.
-            rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
-            for channel, values in zip(self._fine, within, strict=True):
-                stream.send([channel], rows, values)
+        self._record_intermediate(stream, samples, time)
+
+    def _record_signals(
+        self,
+        stream: Stream,
+        columns: Mapping[str, Array],
+        rows: list[rr.TimeColumn],
+        ends: list[rr.TimeColumn],
+    ) -> None:
+        """Send the signals, those of one entity together."""
+        channels_of: dict[str, list[Channel]] = {}
+        values_of: dict[str, list[Array]] = {}
+        for kind, channels in self._kinds.items():
+            column = columns[kind.name]
+            for channel, values in zip(channels, column.reshape(len(column), -1).T, strict=True):
+                channels_of.setdefault(channel.entity, []).append(channel)
+                values_of.setdefault(channel.entity, []).append(values)
+        for entity, channels in channels_of.items():
+            stream.send(channels, rows, np.column_stack(values_of[entity]), ends)
+
+    def _record_status(
+        self, stream: Stream, samples: NDArray[np.int64], time: Array, status: Sequence[str]
+    ) -> None:
+        """Send the status of the samples at which it is another than before."""
+        changes = []
+        for row, word in enumerate(status):
+            if word != self._status:
+                changes.append(row)
+            self._status = word
+        if changes:
+            words = rr.StateChange.columns(state=[drawable(status[row]) for row in changes])
+            stream.rerun.send_columns(_STATUS, times(samples[changes], time[changes]), words)
+
+    def _record_intermediate(self, stream: Stream, samples: NDArray[np.int64], time: Array) -> None:
+        """Send what `intermediate` took since the last call."""
+        if not self._within:
+            return
+        moments, *states = np.array(self._within).T
+        self._within.clear()
+        # A state at the end of a sample counts to that sample.
+        sample = np.maximum(np.searchsorted(time, moments) - 1, 0)
+        rows = times(samples[sample], moments)
+        for channel, values in zip(self._fine, states, strict=True):
+            stream.send([channel], rows, values)
 
     def intermediate(self, time: float, states: Array) -> None:
-        """Take the states (n,) at a time [s] within a sample."""
+        """Take the states within a sample.
+
+        Args:
+            time: in s.
+            states: (n,).
+        """
         self._within.append((time, *states.tolist()))
 
     def close(self) -> None:
@@ -163,56 +210,65 @@ class RerunRecorder:
             self._stream = None
 
     def _group(self, *groups: str) -> list[Channel]:
-        return [
-            c for kind, channels in self._kinds.items() if kind.group in groups for c in channels
-        ]
+        """The channels of the signals of these groups."""
+        selected = []
+        for kind, channels in self._kinds.items():
+            if kind.group in groups:
+                selected += channels
+        return selected
 
     def _layout(self) -> rrb.Blueprint:
         """Left: states and actions with bounds; middle: costs, causes, solver; right: the rest."""
         along = axis(AT(seconds=0.0), AT(seconds=self._seconds))
-        loop = [
-            view(c.title, [c, *(f for f in self._fine if f.name == c.name and f.window())], along)
-            for c in self._group("states", "actions")
-        ]
-        causes = [
-            *(view(c.title, [c], along) for c in self._group("costs")),
+        loop = []
+        for channel in self._group("states", "actions"):
+            within = [fine for fine in self._fine if fine.name == channel.name and fine.window()]
+            loop.append(view(channel.title, [channel, *within], along))
+        causes: list[rrb.View] = []
+        for channel in self._group("costs"):
+            causes.append(view(channel.title, [channel], along))
+        causes += [
             view("disturbances", self._group("disturbances"), along),
             view("prepare and feedback time [s]", self._group("step_time"), along),
             view(self._residual.name, [self._residual], along),
             rrb.StateTimelineView(name="QP status", contents=[f"/{_STATUS}"], time_view=along),
         ]
-        about = rrb.TextDocumentView(name="about this run", origin="/about")
-        predicted = [
-            view(c.title, [c], along, legend=False)
-            for c in chain(*self._predicted.values())
-            if c.window()
-        ]
-        right = rrb.Tabs(rrb.Vertical(*predicted, name="predictions"), about)
-        return layout(
-            rrb.Horizontal(
-                rrb.Vertical(*loop),
-                rrb.Vertical(*causes),
-                right if predicted else about,
-                column_shares=[4, 3, 3],
-            )
-        )
+        right: Any = rrb.TextDocumentView(name="about this run", origin="/about")
+        predicted = []
+        for channel in chain(*self._predicted.values()):
+            if channel.window():
+                predicted.append(view(channel.title, [channel], along, legend=False))
+        if predicted:
+            right = rrb.Tabs(rrb.Vertical(*predicted, name="predictions"), right)
+        middle = rrb.Vertical(*causes)
+        return layout(rrb.Horizontal(rrb.Vertical(*loop), middle, right, column_shares=[4, 3, 3]))
 
 
 def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:
     """The signals of a kind as they are drawn; a unit not known is left empty."""
     colors = cycle(SERIES[2:] if kind.name == "actions" else SERIES)
-    return [
-        Channel(
-            f"{kind.group}/{escaped(name)}" if kind.group in ALONE else str(kind.group),
-            name,
-            unit,
-            SERIES[1] if name in ("penalty", "feedback_time") else next(colors),
-            scenario.limits.get(name, FREE) if kind.vector else FREE,
+    channels = []
+    for name, unit in kind.units(scenario, units).items():
+        alone = kind.group in ALONE
+        second_of_its_view = name in ("penalty", "feedback_time")
+        channel = Channel(
+            entity=f"{kind.group}/{escaped(name)}" if alone else str(kind.group),
+            name=name,
+            unit=unit,
+            color=SERIES[1] if second_of_its_view else next(colors),
+            bounds=scenario.limits.get(name, FREE) if kind.vector else FREE,
             step=kind.name in HELD,
             tail=0.05 if kind.clock else 0.0,
         )
-        for name, unit in kind.units(scenario, units).items()
-    ]
+        channels.append(channel)
+    return channels
+
+
+def _predicted_channel(channel: Channel) -> Channel:
+    """The prediction of a signal, as it is drawn."""
+    return Channel(
+        f"prediction/{escaped(channel.name)}", f"prediction/{channel.name}", channel.unit
+    )
 
 
 def _about(scenario: Scenario, properties: Mapping[str, object]) -> str:
@@ -230,81 +286,97 @@ penalty of violating the state bounds (red lines).
 """
 
 
-def spare_pandas() -> None:
-    """Let pyarrow go without pandas in this process, unless something has imported it.
-
-    pyarrow would import it, 46 MB and an eighth of a second, to see that a list is no series.
-    """
-
-    class Missing:
-        @staticmethod
-        def find_spec(name: str, *_: object) -> None:
-            if name == "pandas":
-                raise ModuleNotFoundError(name)
-
-    if "pandas" not in sys.modules:
-        sys.meta_path.insert(0, Missing)
-        pyarrow.array([0.0])  # pyarrow looks once
-        sys.meta_path.remove(Missing)
-
-
 def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str) -> None:
-    """Write a recording of runs of one scenario by name, over each other; errors as of a run's.
+    """Write a recording of runs of one scenario over each other.
 
     The signals are `<run>/<signal>` for every signal that all runs have, and, of two runs,
-    `difference/<signal>`; bounds are those that the first run knows. `about` is Markdown.
+    `difference/<signal>`. Bounds are those that the first run knows.
+
+    Args:
+        path: of the file.
+        runs: signals of each run, by its name.
+        about: Markdown of the view `/about`.
+
+    Raises:
+        OSError: if the file cannot be begun.
+        RecordingError: if it is not written whole.
     """
-    from cosim.figures.style import lit, palette  # noqa: PLC0415 - matplotlib: a third of a second
+    from cosim.figures.style import lighten, palette  # noqa: PLC0415 - matplotlib: 0.3 s
 
     first, *others = runs.values()
-    times_of = {
-        name: run.signals["time"].values if "time" in run.signals else np.arange(float(len(run)))
-        for name, run in runs.items()
-    }
-    rows = {name: times(np.arange(len(time)), time) for name, time in times_of.items()}
-    colors = {name: lit(look.color) for name, look in palette(list(runs)).items()}
-    seconds = max((float(time[-1]) for time in times_of.values() if len(time)), default=0.0)
+    colors = {name: lighten(style.color) for name, style in palette(list(runs)).items()}
+    time_of = {}
+    for name, run in runs.items():
+        if "time" in run.signals:
+            time_of[name] = run.signals["time"].values
+        else:
+            time_of[name] = np.arange(float(len(run)))
+    seconds = max((float(time[-1]) for time in time_of.values() if len(time)), default=0.0)
     along = axis(AT(seconds=0.0), AT(seconds=seconds))
-    ends = times([0, max(map(len, runs.values())) - 1], np.array([0.0, seconds]))
-    title, overlaid, differences = " / ".join(runs), [], []
+    last = max(len(run) for run in runs.values()) - 1
+    ends = times([0, last], np.array([0.0, seconds]))
+    title = " / ".join(runs)
+    overlaid, differences = [], []
     with Stream(path, title, about) as stream:
-        for signal, own in first.signals.items():
+        for signal, of_first in first.signals.items():
             if signal == "time" or not all(signal in run.signals for run in others):
                 continue
             lines = []
             for name, run in runs.items():
-                entity, bounds = f"{escaped(name)}/{escaped(signal)}", FREE
-                if run is first:
-                    bounds = first.bounds.get(signal, FREE)
-                line = Channel(entity, f"{name}/{signal}", own.unit, colors[name], bounds, [name])
-                stream.send([line], rows[name], run.signals[signal].values, ends)
+                line = Channel(
+                    f"{escaped(name)}/{escaped(signal)}",
+                    f"{name}/{signal}",
+                    of_first.unit,
+                    colors[name],
+                    first.bounds.get(signal, FREE) if run is first else FREE,
+                    labels=[name],
+                )
+                time = time_of[name]
+                rows = times(np.arange(len(time)), time)
+                stream.send([line], rows, run.signals[signal].values, ends)
                 lines.append(line)
             overlaid.append(view(replace(lines[0], name=signal).title, lines, along))
             if len(runs) == 2:
-                a, b = (run.signals[signal].values for run in runs.values())
-                common = min(len(a), len(b))
-                with np.errstate(invalid="ignore"):
-                    values = a[:common] - b[:common]
-                entity, name = f"difference/{escaped(signal)}", f"difference/{signal}"
-                line = Channel(entity, name, own.unit, SERIES[3])
-                time = next(iter(times_of.values()))[:common]
-                stream.send([line], times(np.arange(common), time), values)
+                entity = f"difference/{escaped(signal)}"
+                line = Channel(entity, f"difference/{signal}", of_first.unit, SERIES[3])
+                values = _difference(of_first.values, others[0].signals[signal].values)
+                time = next(iter(time_of.values()))[: len(values)]
+                stream.send([line], times(np.arange(len(values)), time), values)
                 differences.append(view(line.title, [line], along))
         stream.layout = _tabs({title: overlaid, "difference": differences})
 
 
+def _difference(one: Array, other: Array) -> Array:
+    """One signal less the other, (K,), over the K samples that both have."""
+    common = min(len(one), len(other))
+    with np.errstate(invalid="ignore"):
+        difference: Array = one[:common] - other[:common]
+    return difference
+
+
 def _tabs(tabs: Mapping[str, Sequence[rrb.View]], timeline: str = TIME) -> rrb.Blueprint:
-    grids = [rrb.Grid(*views, grid_columns=3, name=name) for name, views in tabs.items() if views]
+    """A tab for each title with its views in a grid, where it has any, and the page about it."""
+    grids = []
+    for name, views in tabs.items():
+        if views:
+            grids.append(rrb.Grid(*views, grid_columns=3, name=name))
     page = rrb.TextDocumentView(name="about", origin="/about")
     return layout(rrb.Tabs(*grids, page), timeline)
 
 
 def record_training(path: str | Path, training: Training) -> None:
-    """Write a recording of a training: the signals are the log's columns and `increment/<block>`.
+    """Write a recording of a training.
 
-    `increment/<block>` is the change of a block of θ since the start, (K, size).
+    The signals are the log's columns and `increment/<block>`, the change of a block of θ since the
+    start, (K, size).
 
-    Raises OSError where the file cannot be begun, RecordingError where it is not written whole.
+    Args:
+        path: of the file.
+        training: what `train` returned.
+
+    Raises:
+        OSError: if the file cannot be begun.
+        RecordingError: if it is not written whole.
     """
     run, blocks, log = training.run, training.parameters.blocks, training.log()
     properties = {
@@ -316,10 +388,11 @@ def record_training(path: str | Path, training: Training) -> None:
         **run.configuration.model_dump(mode="json"),
     }
     samples = log["samples"].astype(np.int64)
-    rows, theta, course = times(samples), [], []
+    rows = times(samples)
     along = axis(AT(seq=0), AT(seq=int(samples[-1]) if len(samples) else 0))
     title = f"{run.algorithm} on {run.scenario.name}"
     about = f"# {title}\n\n{_table('training', properties)}"
+    theta, course = [], []
     with Stream(path, title, about, properties) as stream:
         for name, values in training.theta().items():
             labels = list(blocks.labels[blocks.slices[name]])
@@ -327,8 +400,9 @@ def record_training(path: str | Path, training: Training) -> None:
             stream.send([block], rows, values)
             theta.append(view(f"change of {name}", [block], along))
         for (name, values), color in zip(log.items(), cycle(SERIES), strict=False):
-            rare = bool(np.isnan(values).any())
-            column = Channel(f"log/{escaped(name)}", name, color=color, points=rare)
+            # What is not measured at every row is drawn as dots.
+            sparse = bool(np.isnan(values).any())
+            column = Channel(f"log/{escaped(name)}", name, color=color, points=sparse)
             stream.send([column], rows, values)
             course.append(view(name, [column], along))
         stream.layout = _tabs({"θ": theta, "log": course}, SAMPLE)
@@ -360,9 +434,11 @@ class Channel:
     @property
     def title(self) -> str:
         """Name, unit and bounds in words: the viewer's font has no ≥."""
-        label = self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"
-        sides = zip(("at least", "at most"), self.bounds, strict=True)
-        return ", ".join([label, *(f"{side} {b:g}" for side, b in sides if isfinite(b))])
+        parts = [self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"]
+        for side, bound in zip(("at least", "at most"), self.bounds, strict=True):
+            if isfinite(bound):
+                parts.append(f"{side} {bound:g}")
+        return ", ".join(parts)
 
     def see(self, values: Array) -> None:
         """Widen the range seen by values of any shape."""
@@ -378,9 +454,12 @@ class Channel:
         if low > high:
             return None
         lower, upper = self.bounds
+        # A signal that is constant has a span, too.
         span = max(high - low, 1e-3 * max(abs(low), abs(high))) or 1.0
-        low = min(low, lower) if low - span <= lower else low
-        high = max(high, upper) if upper <= high + span else high
+        if low - span <= lower:
+            low = min(low, lower)
+        if upper <= high + span:
+            high = max(high, upper)
         margin = 0.06 * max(high - low, span)
         return low - margin, high + margin
 
@@ -438,27 +517,37 @@ class Stream:
         values: Array,
         ends: list[rr.TimeColumn] | None = None,
     ) -> None:
-        """Send K rows of the signals of one entity: (K,), (K, m), or (K, labels).
+        """Send K rows of the signals of one entity.
 
-        Finite bounds are drawn between two times `ends`.
+        Args:
+            channels: the signals.
+            times: of the rows.
+            values: (K,) or (K, labels) of one signal, (K, m) of m.
+            ends: two times, between which finite bounds are drawn.
         """
         entity = channels[0].entity
-        for channel, column in zip(
-            channels, values.T if len(channels) > 1 else [values], strict=True
-        ):
+        columns = values.T if len(channels) > 1 else [values]
+        for channel, column in zip(channels, columns, strict=True):
             channel.see(column)
-            for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
-                if ends and isfinite(bound):
-                    line = Channel(f"bounds/{channel.entity}/{side}", f"{side} bound", color=BOUND)
-                    self.rerun.log(line.entity, _style([line]), static=True)
-                    drawn = rr.Scalars.columns(scalars=[bound, bound])
-                    self.rerun.send_columns(line.entity, ends, drawn)
+            if ends:
+                self._send_bounds(channel, ends)
         if entity not in self._declared:
             self._declared.add(entity)
-            names, units = [c.name for c in channels], [c.unit for c in channels]
+            names = [channel.name for channel in channels]
+            units = [channel.unit for channel in channels]
             mark = rr.DynamicArchetype(SIGNAL, components={"name": names, "unit": units})
             self.rerun.log(entity, mark, _style(channels), static=True)
         self.rerun.send_columns(entity, times, rr.Scalars.columns(scalars=np.array(values)))
+
+    def _send_bounds(self, channel: Channel, ends: list[rr.TimeColumn]) -> None:
+        """Draw the finite bounds of a signal between two times."""
+        for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
+            if not isfinite(bound):
+                continue
+            line = Channel(f"bounds/{channel.entity}/{side}", f"{side} bound", color=BOUND)
+            self.rerun.log(line.entity, _style([line]), static=True)
+            level = rr.Scalars.columns(scalars=[bound, bound])
+            self.rerun.send_columns(line.entity, ends, level)
 
     def close(self) -> None:
         """Finish the file, with the layout, and give it its name.
@@ -470,10 +559,13 @@ class Stream:
         if self.layout is not None:
             self.rerun.send_blueprint(self.layout)
         self._bounded(self.rerun.disconnect)
+        # Rerun does not say that the disk was full: the file then lacks its footer.
+        size = self._partial.stat().st_size
         with self._partial.open("rb") as written:
-            written.seek(-min(len(_FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
-            if _FOOTER not in written.read():
-                self._give_up("its end is missing")
+            written.seek(-min(len(_FOOTER) + 32, size), os.SEEK_END)
+            complete = _FOOTER in written.read()
+        if not complete:
+            self._give_up("its end is missing")
         publish(self._partial, self.path)
 
     def discard(self) -> None:
@@ -501,23 +593,24 @@ class Stream:
 
 
 def _style(channels: Sequence[Channel]) -> rr.SeriesLines | rr.SeriesPoints:
+    """How the signals of one entity are drawn: their labels, colours, and lines or dots."""
     first = channels[0]
     labels = first.labels or [channel.title.partition(",")[0] for channel in channels]
-    colors = [c.color for c in channels]
-    if len(labels) > len(colors):
-        colors = [SERIES[i % len(SERIES)] for i in range(len(labels))]
     names = [drawable(label) for label in labels]
+    colors = [channel.color for channel in channels]
+    if len(names) > len(colors):
+        colors = [SERIES[i % len(SERIES)] for i in range(len(names))]
     # An array, since Rerun misreads a list of three numbers as one colour.
     packed = np.array([packed_color(color) for color in colors], dtype=np.uint32)
     if first.points:
         return rr.SeriesPoints(names=names, colors=packed, marker_sizes=np.full(len(names), 4.0))
-    mode, policy = rr.components.InterpolationMode, rr.components.AggregationPolicy
+    mode = rr.components.InterpolationMode
     return rr.SeriesLines(
         names=names,
         colors=packed,
         widths=np.full(len(names), 1.5),
         # The default average would hide the violations of a run that is wider than the screen.
-        aggregation_policy=policy.MinMax,
+        aggregation_policy=rr.components.AggregationPolicy.MinMax,
         interpolation_mode=mode.StepAfter if first.step else mode.Linear,
     )
 
@@ -529,14 +622,21 @@ def packed_color(color: str) -> int:
 
 def drawable(text: str) -> str:
     """Replace by `?` each character that the viewer's font lacks: the headless viewer aborts."""
-    return "".join(
-        c if c == "\n" or any(low <= ord(c) <= high for low, high in _DRAWABLE) else "?"
-        for c in text
-    )
+    return "".join(character if _is_drawable(character) else "?" for character in text)
+
+
+def _is_drawable(character: str) -> bool:
+    code = ord(character)
+    return character == "\n" or any(low <= code <= high for low, high in _DRAWABLE)
 
 
 def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> list[rr.TimeColumn]:
-    """Index columns of K rows: sample numbers and, where there is one, the time in s to 1 ns."""
+    """Index columns of K rows.
+
+    Args:
+        samples: their numbers, (K,).
+        time: in s, (K,), recorded to 1 ns; None where there is none.
+    """
     columns = [rr.TimeColumn(SAMPLE, sequence=np.asarray(samples, dtype=np.int64))]
     if time is not None:
         nanoseconds = np.rint(time * 1e9).astype("timedelta64[ns]")
@@ -552,16 +652,28 @@ def axis(start: rr.TimeRangeBoundary, end: rr.TimeRangeBoundary) -> rrb.TimeAxis
 def view(
     title: str, channels: Sequence[Channel], along: rrb.TimeAxis, *, legend: bool | None = None
 ) -> rrb.TimeSeriesView:
-    """A plot of signals and their bounds, in the range of view of all of them."""
-    windows = [window for channel in channels if (window := channel.window())]
-    shown = (min(low for low, _ in windows), max(high for _, high in windows)) if windows else None
-    entities = dict.fromkeys(channel.entity for channel in channels)
+    """A plot of signals and their bounds, in the range of view of all of them.
+
+    Args:
+        title: of the plot.
+        channels: the signals.
+        along: the horizontal axis.
+        legend: whether it is drawn; by default where there are several signals.
+    """
+    lows, highs = [], []
+    for channel in channels:
+        if window := channel.window():
+            lows.append(window[0])
+            highs.append(window[1])
+    contents = []
+    for entity in dict.fromkeys(channel.entity for channel in channels):
+        contents += [f"/{entity}", f"/bounds/{entity}/**"]
     return rrb.TimeSeriesView(
         name=drawable(title),
         origin="/",
-        contents=[path for e in entities for path in (f"/{e}", f"/bounds/{e}/**")],
+        contents=contents,
         axis_x=along,
-        axis_y=rrb.ScalarAxis(range=shown) if shown else None,
+        axis_y=rrb.ScalarAxis(range=(min(lows), max(highs))) if lows else None,
         plot_legend=rrb.PlotLegend(
             corner=rrb.Corner2D.RightTop, visible=len(channels) > 1 if legend is None else legend
         ),
@@ -569,7 +681,12 @@ def view(
 
 
 def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
-    """The views with a paused time panel on a timeline, and no other panels in the way."""
+    """The layout of a recording, with no other panels in the way.
+
+    Args:
+        root: the views.
+        timeline: that of the time panel, which is paused.
+    """
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),

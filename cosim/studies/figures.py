@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
+from cosim.errors import StudyError
 from cosim.figures import style
-from cosim.figures.style import BOUND, DASHED, Dots, EndLabel, Look, palette, shown_case
+from cosim.figures.style import BOUND, DASHED, DotRow, EndLabel, LineStyle, palette, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.measurement import built
@@ -36,7 +37,7 @@ PREFIX = "theta "
 GRID, BINS = 13, 80
 
 
-def regret_figure(rows: Sequence[Dots], looks: Mapping[str, Look]) -> Figure:
+def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Figure:
     """A row for each case: its runs, their interquartile mean and its 95 % interval.
 
     A run that diverged is a cross; an interval that goes on to the left of the axes ends in an
@@ -45,7 +46,7 @@ def regret_figure(rows: Sequence[Dots], looks: Mapping[str, Look]) -> Figure:
     rows = sorted(rows, key=lambda row: row.middle)
     with style.figure(0.21 * len(rows) + 0.9) as drawn:
         axes = drawn.subplots()
-        values = style.dot_rows(axes, rows, looks)
+        values = style.dot_rows(axes, rows, styles)
         style.regret_axis(axes, "x", np.append(values, [0.0, *(row.high for row in rows)]))
         left = axes.get_xlim()[0]
         cut = [y for y, row in enumerate(rows) if row.low < left]
@@ -78,7 +79,7 @@ def learning_curve(log: pd.DataFrame, best: float | None) -> dict[str, Array]:
 def curves_figure(
     curves: Mapping[str, Mapping[str, Array]],
     levels: Mapping[str, float],
-    looks: Mapping[str, Look],
+    styles: Mapping[str, LineStyle],
     *,
     relative: bool,
 ) -> Figure:
@@ -107,7 +108,7 @@ def curves_figure(
                     if not values.size:
                         continue
                     low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
-                    color, line = looks[name].color, (own if start else looks)[name].line
+                    color, line = styles[name].color, (own if start else styles)[name].line
                     look: Any = {"color": color, "linestyle": line, "linewidth": 1.3}
                     lines.append((name, samples, middle, look))
                     rule = shown_case(name).replace(start.replace("from", ","), "")
@@ -143,7 +144,10 @@ def _by_start(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def operation_figure(
-    found: Judged, about: Mapping[str, Any], looks: Mapping[str, Look], baselines: Sequence[str]
+    found: Judged,
+    about: Mapping[str, Any],
+    styles: Mapping[str, LineStyle],
+    baselines: Sequence[str],
 ) -> Figure:
     """Greedy regret and regret so far against the plant's samples, on log axes.
 
@@ -163,7 +167,7 @@ def operation_figure(
             ends = []
             for case, rows in lives.groupby("case", sort=False):
                 runs = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
-                color, line = looks[str(case)].color, lines[str(case)].line
+                color, line = styles[str(case)].color, lines[str(case)].line
                 known = case in baselines
                 dashes, width = (DASHED, 0.9) if known else (line, 1.5)
                 axes.plot(runs.index, runs["median"], c=color, ls=dashes, lw=width)
@@ -195,9 +199,21 @@ def operation_figure(
     return drawn
 
 
-def draw(plan: Plan, out: Path) -> list[str]:
-    """Draw the kept trajectories and logs into `out`/figures; returns the figures' names."""
-    return style.save_set(_figures(plan, out), out / FOLDER)
+def draw(plan: Plan, out: Path, formats: Sequence[str] = style.FORMATS) -> list[str]:
+    """Draw the trajectories and logs that a study keeps.
+
+    Args:
+        plan: the study's plan, which names the kept files.
+        out: the study's folder, or its stored one; the figures are written to `out`/figures.
+        formats: of the files, as in `save_set`.
+
+    Returns:
+        Names of the figures.
+
+    Raises:
+        StudyError: if a phase portrait needs θ of a training that `out` does not hold.
+    """
+    return style.save_set(_figures(plan, out), out / FOLDER, formats)
 
 
 def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
@@ -261,13 +277,13 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
     edges = bound + width * np.arange(
         -np.ceil((bound - low) / width) - 1, np.ceil((high - bound) / width) + 2
     )
-    looks = palette(list(samples))
+    styles = palette(list(samples))
     with style.figure(2.9, 4.6) as drawn:
         axes = drawn.subplots()
         for case, values in samples.items():
             share = 100 * float(np.mean(bound - values > VIOLATING))
             heights = np.histogram(values, edges)[0] / (len(values) * width)
-            color = looks[case].color
+            color = styles[case].color
             axes.stairs(heights, edges, fill=True, alpha=0.12, color=color)
             text = f"{shown_case(case)}: {share:.1f} % below"
             axes.stairs(heights, edges, color=color, linewidth=1.2, label=text)
@@ -357,8 +373,15 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
 
 
 def _policy(run: Run, out: Path) -> Policy:
-    trained = run.training is not None
-    theta = (out / run.folder / PARAMETERS).read_text("utf-8") if trained else ""
+    theta = ""
+    if run.training is not None:
+        path = out / run.folder / PARAMETERS
+        if not path.is_file():
+            raise StudyError(
+                f"the phase portrait of '{run.case}' needs its θ, and there is no '{path}'; "
+                "run the study again"
+            )
+        theta = path.read_text("utf-8")
     controller = built(run.source(theta), run.scenario)
 
     def act(s: Array) -> Array:

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from cosim import statistics
 from cosim.errors import FailedRunsError, StudyError
 from cosim.evaluation import EVALUATION, TIMING, Progress
-from cosim.figures.style import Dots, Look, palette, save_set
+from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
 from cosim.files import read_json, staged, write_atomically
 from cosim.processes import holding
 from cosim.protocols import Array
@@ -39,7 +39,7 @@ from cosim.studies.run import (
     to_csv,
     typed,
 )
-from cosim.validation import instead, known_keywords
+from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
@@ -428,8 +428,16 @@ class StudyResults(Shown):
     def _makers(self) -> dict[str, Callable[[str], Figure | None]]:
         return {"curves": self._curves, "regret": self._regret, "operation": self._operation}
 
-    def draw(self, folder: Path) -> dict[str, list[str]]:
-        """Draw all figures into a folder; returns their names by scenario."""
+    def draw(self, folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, list[str]]:
+        """Draw the figures of the tables.
+
+        Args:
+            folder: where the files are written.
+            formats: of the files, `svg` or `png`; a file of each is written.
+
+        Returns:
+            Names of the figures by scenario.
+        """
         return {
             scenario: save_set(
                 (
@@ -438,12 +446,13 @@ class StudyResults(Shown):
                     if (drawn := maker(scenario)) is not None
                 ),
                 folder,
+                formats,
             )
             for scenario in self.scenarios
         }
 
     @property
-    def _looks(self) -> dict[str, Look]:
+    def _styles(self) -> dict[str, LineStyle]:
         return palette(list(self.cases), self.scenarios)
 
     def _regret(self, scenario: str) -> Figure | None:
@@ -457,8 +466,8 @@ class StudyResults(Shown):
                 middle, low, high = (100 * row[f"{kind}{end}"] for end in ("", "_low", "_high"))
                 lost = self.of(case, scenario).status.str.startswith("diverged").to_numpy()
                 values = 100 * self.regrets(case, scenario)
-                rows.append(Dots(case, values, ~lost, middle, low, high))
-        return figures.regret_figure(rows, self._looks) if rows else None
+                rows.append(DotRow(case, values, ~lost, middle, low, high))
+        return figures.regret_figure(rows, self._styles) if rows else None
 
     def _curves(self, scenario: str) -> Figure | None:
         """None if no training was evaluated more than once."""
@@ -482,7 +491,7 @@ class StudyResults(Shown):
         chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
         level = 100 * statistics.regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
         levels = dict(zip(chosen, map(float, level), strict=True))
-        return figures.curves_figure(curves, levels, self._looks, relative=known)
+        return figures.curves_figure(curves, levels, self._styles, relative=known)
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, needed=["samples"])
@@ -509,14 +518,16 @@ class StudyResults(Shown):
         about, judged = self.about["operation"][scenario], self._judged(scenario)
         if judged.lives.samples.nunique() == 1:  # no course to draw
             return None
-        return figures.operation_figure(judged, about, self._looks, self.baselines)
+        return figures.operation_figure(judged, about, self._styles, self.baselines)
 
     def report(self) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
         page = self._page(self.draw(self.folder / report.FOLDER))
 
-        def picture(name: str) -> dict[str, str]:
-            return report.image(self.folder / report.FOLDER / f"{name}.svg")
+        def picture(name: str) -> dict[str, str] | None:
+            path = self.folder / report.FOLDER / f"{name}.svg"
+            # Those of a stored study's single runs are there once `cosim results draw` drew them.
+            return report.image(path) if path.is_file() else None
 
         for name in (report.TABLES, report.PAGE):
             write_atomically(self.folder / name, report.rendered(name, **page, picture=picture))
@@ -662,7 +673,6 @@ def document(plan: Plan) -> dict[str, Any]:
     return dict(json.loads(json.dumps(about)))
 
 
-@known_keywords
 def study(
     source: Study | str | Path | Mapping[str, Any],
     out: str | Path,

@@ -16,10 +16,11 @@ from cosim.errors import ResultsError
 from cosim.evaluation import EVALUATION, TIMING
 from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
+from cosim.studies import figures
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
-from cosim.studies.plan import LOGS, THETA, TRAJECTORIES
-from cosim.studies.report import rendered
+from cosim.studies.plan import LOGS, THETA, TRAJECTORIES, Study, plan
+from cosim.studies.report import FOLDER, rendered
 from cosim.studies.results import (
     ABOUT,
     AGGREGATE,
@@ -54,7 +55,8 @@ KEY_COLUMNS = {
 """Key columns of a study's tables, by their file or by the folder that they are in."""
 LARGEST = 4_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
-SUFFIXES = (".csv", ".toml", ".md", ".svg", ".png")
+SUFFIXES = (".csv", ".toml", ".md")
+"""Of the files that are stored: figures are drawn from them."""
 
 
 def stored_results() -> Path:
@@ -106,6 +108,29 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     shutil.rmtree(target, ignore_errors=True)
     fresh.replace(target)
     return left_out
+
+
+def draw(folder: Path, name: str) -> list[str]:
+    """Draw the figures of a stored study, from its tables alone, as NAME/figures/*.svg.
+
+    Args:
+        folder: of the stored studies.
+        name: of the study.
+
+    Returns:
+        Names of the figures.
+
+    Raises:
+        StudyError: if the study is not stored or its tables are damaged.
+    """
+    stored = folder / name
+    results = StudyResults.load(stored)
+    names: list[str] = []
+    for of_scenario in results.draw(stored / FOLDER, ("svg",)).values():
+        names += of_scenario
+    if results.about["pictures"]:  # of the trajectories and logs that the study keeps
+        names += figures.draw(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
+    return names
 
 
 def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:

@@ -3,7 +3,6 @@
 
 #include "fmi3Functions.h"
 
-#include "adjoint.h"
 #include "derivatives.h"
 #include "events.h"
 #include "seed.h"
@@ -339,17 +338,6 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueRe
                                               seed, sensitivity);
 }
 
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[],
-                                    size_t nUnknowns, const fmi3ValueReference knowns[],
-                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                    fmi3Float64 sensitivity[], size_t nSensitivity) {
-    ENTER(READABLE);
-    TRY(check_arrays(self, __func__, unknowns, nUnknowns, seed, nSeed));
-    TRY(check_arrays(self, __func__, knowns, nKnowns, sensitivity, nSensitivity));
-    return (fmi3Status)adjoint_derivative(self, __func__, unknowns, nUnknowns, knowns, nKnowns,
-                                          seed, sensitivity);
-}
-
 /* Discrete states and model exchange */
 
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
@@ -546,6 +534,15 @@ fmi3Status fmi3GetOutputDerivatives(fmi3Instance instance,
                                     size_t nValueReferences, const fmi3Int32 orders[],
                                     fmi3Float64 values[], size_t nValues) {
     (void)valueReferences, (void)nValueReferences, (void)orders, (void)values, (void)nValues;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[],
+                                    size_t nUnknowns, const fmi3ValueReference knowns[],
+                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+                                    fmi3Float64 sensitivity[], size_t nSensitivity) {
+    (void)unknowns, (void)nUnknowns, (void)knowns, (void)nKnowns, (void)seed, (void)nSeed;
+    (void)sensitivity, (void)nSensitivity;
     return refuse(instance, __func__);
 }
 

@@ -9,7 +9,7 @@
 #define FMI3_FUNCTION_PREFIX evaporator_
 #endif
 
-#define MODEL_TOKEN "{4b2ab9db-c6a8-56b3-80d2-38ec28c993f3}"
+#define MODEL_TOKEN "{eea8899d-99f8-5362-9e5b-f15484eab7aa}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
 #define LAYOUT_DIGEST UINT64_C(0x9bf4eee7a86d70a1)

@@ -69,11 +69,16 @@ except SystemExit: pass
 print(*sorted({heavy!r} & set(sys.modules)), file=sys.stderr)
 """
 HEAVY = {"numpy", "pydantic", "casadi", "fmpy", "rerun", "matplotlib", "scipy", "filelock"}
-NOT_RUN = {"scipy", "pandas", "matplotlib"}
+NOT_RUN = {"scipy", "matplotlib"}
 
 
 @pytest.mark.parametrize(
-    ("words", "heavy"), [("'--help'", HEAVY), ("'simulate','--record','-n','1','-o'", NOT_RUN)]
+    ("words", "heavy"),
+    [
+        ("'--help'", HEAVY),
+        ("'simulate','-n','1','-o'", NOT_RUN | {"pandas", "rerun"}),
+        ("'simulate','--record','-n','1','-o'", NOT_RUN),
+    ],
 )
 def test_a_command_loads_no_library_that_it_does_not_need(tmp_path, words, heavy):
     code = LOADED.format(words=words, heavy=heavy)

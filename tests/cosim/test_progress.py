@@ -1,8 +1,7 @@
 """Bars of `progress=True`: each ends where the work does."""
 
 import pytest
-import tqdm.auto
-from tqdm.std import tqdm as Bar
+import rich.progress
 
 from cosim import FmuPlant, build_controller, evaluate, simulate, train
 from tests.helpers.toy_study import run_toy
@@ -30,12 +29,13 @@ def a_study(_, folder):
 def test_a_bar_ends_full_with_the_work(work, paper, tmp_path, monkeypatch):
     bars = []
 
-    class Seen(Bar):
+    class Seen(rich.progress.Progress):
         def __init__(self, *arguments, **options):
             super().__init__(*arguments, **options)
             bars.append(self)
 
-    monkeypatch.setattr(tqdm.auto, "tqdm", Seen)
+    monkeypatch.setattr(rich.progress, "Progress", Seen)
     work(paper, tmp_path)
     (bar,) = bars
-    assert bar.n == bar.total > 0
+    (task,) = bar.tasks
+    assert task.completed == task.total > 0

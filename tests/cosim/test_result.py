@@ -61,21 +61,6 @@ def test_every_result_is_a_line_a_table_and_a_page(run, training, tmp_path):
             assert result.table().startswith("| ") and result.figure().axes
 
 
-@pytest.mark.parametrize(
-    ("function", "typo", "meant"),
-    [
-        (cosim.simulate, "recoder", "recorder"),
-        (cosim.train, "evaluate_evry", "evaluate_every"),
-        (cosim.evaluate, "step", "steps"),
-        (cosim.study, "job", "jobs"),
-        (cosim.FmuPlant, "fmuu", "fmu"),
-    ],
-)
-def test_an_unknown_keyword_is_refused_with_the_one_that_is_meant(function, typo, meant):
-    with pytest.raises(cosim.errors.ArgumentError, match=f"'{typo}'.*'{meant}'"):
-        function(**{typo: 1})
-
-
 def test_frames_hold_the_values(run, training):
     frame = run.to_pandas()
     np.testing.assert_array_equal(frame["X2"], run["X2"])

@@ -33,7 +33,7 @@ COVERED = {
     "cosim study report study": "a synopsis; docs/how-to/study.md",
     "cosim compare run other-run": "a synopsis; tests/cosim/cli/test_compare.py",
     "cosim fmu info|check|build": "a synopsis; tests/cosim/cli/test_fmu.py",
-    "cosim results check|update|board": "a synopsis; tests/cosim/studies/test_stored.py",
+    "cosim results check|update|draw": "a synopsis; tests/cosim/studies/test_stored.py",
 }
 # Typed with a smaller budget than the page's, which is meant for a reader with time.
 SMALLER = {

@@ -89,6 +89,7 @@ def test_the_sdist_holds_what_a_fork_needs(sdist):
     expected = {"constraints.txt", "Makefile", "results/learning.toml", "tests/faults"}
     assert expected <= names
     assert not {name for name in names if name.endswith((".rrd", ".pyc"))}
+    assert not {name for name in names if name.startswith("results/") and "/figures/" in name}
 
 
 def test_the_wheel_holds_the_committed_data_to_the_byte(wheel, checkout):
@@ -104,6 +105,9 @@ def test_the_wheel_holds_the_committed_data_to_the_byte(wheel, checkout):
     assert len(files) > 20
     for path in files:
         assert stored[str(path.relative_to(checkout))] == path.read_bytes()
+    assert not {
+        name for name in stored if name.startswith("cosim/results/") and "/figures/" in name
+    }
     tables = [path.relative_to(checkout) for path in checkout.glob("results/**/*.csv")]
     assert tables
     for path in tables:

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.figures.style import lit, palette, shown_case
+from cosim.figures.style import lighten, palette, shown_case
 from cosim.studies.figures import (
     curves_figure,
     density_figure,
@@ -52,13 +52,13 @@ def test_a_curve_averages_training_since_the_point_before_and_holds_diverged_run
 
 
 def test_a_dark_ground_hides_no_controller():
-    looks = palette(["naive", "q-learning", "optimal", "dyna"]).values()
-    assert [lit(look.color) for look in looks] == ["#7f7f7f", "#0072B2", "#c8c8c8", "#523ace"]
+    styles = palette(["naive", "q-learning", "optimal", "dyna"]).values()
+    assert [lighten(look.color) for look in styles] == ["#7f7f7f", "#0072B2", "#c8c8c8", "#523ace"]
 
 
 def test_one_controller_has_one_colour_on_all_scenarios():
-    looks = palette(["two-fouled", "two-jump", "q"], ["fouled", "jump"])
-    assert len({look.color for look in looks.values()}) == 2
+    styles = palette(["two-fouled", "two-jump", "q"], ["fouled", "jump"])
+    assert len({look.color for look in styles.values()}) == 2
 
 
 def test_increments_are_of_each_block_since_its_first_row():

@@ -1,11 +1,13 @@
 """The stored studies themselves: they hold, and small changes do not go unnoticed."""
 
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from cosim import StudyResults
 from cosim.cli.main import app
 from cosim.studies.run import read_table
 from cosim.studies.stored import stored_studies
@@ -83,14 +85,35 @@ def test_what_was_stored_checks(mini):
     assert code == 0, output
 
 
-def test_update_stores_tables_figures_report_and_readme(mini):
+def test_a_stored_study_s_figures_are_drawn_from_its_tables(mini, tmp_path):
+    folder = tmp_path / "results"
+    shutil.copytree(mini, folder, ignore=shutil.ignore_patterns(".work"))
+    result = run("draw", "mini", "--results", folder)
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    linked = re.findall(r"\]\((figures/.*?)\)", (folder / "mini" / "report.md").read_text())
+    assert {"figures/overlay-paper-loop.svg", "figures/regret-paper.svg"} <= set(linked)
+    drawn = [path.relative_to(folder / "mini").as_posix() for path in folder.rglob("*.svg")]
+    assert sorted(drawn) == sorted(linked)
+
+
+def test_a_report_of_a_stored_study_without_its_figures_says_so(mini, tmp_path):
+    folder = tmp_path / "mini"
+    shutil.copytree(mini / "mini", folder)
+    before = (folder / "report.md").read_text()
+    page = StudyResults.load(folder).report().read_text("utf-8")
+    assert "overlay-paper-loop is not drawn" in page
+    assert 'alt="regret-paper"' in page
+    assert (folder / "report.md").read_text() == before
+
+
+def test_update_stores_tables_report_and_readme(mini):
     names = {path.relative_to(mini / "mini").as_posix() for path in (mini / "mini").rglob("*.*")}
     assert {
         *("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "study.json", "report.md"),
         *("trajectories/loop/paper/naive.csv", "trajectories/loop/paper/optimal.csv"),
-        *("figures/overlay-paper-loop.svg", "figures/overlay-paper-loop.png"),
     } <= names
-    assert not {name for name in names if name.startswith("runs/") or "timing" in name}
+    assert not {name for name in names if name.startswith(("runs/", "figures/"))}
+    assert not {name for name in names if "timing" in name}
     assert "| tuned |" in (mini / "README.md").read_text()
 
 

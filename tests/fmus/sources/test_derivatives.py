@@ -1,4 +1,4 @@
-"""Derivatives of the FMU against differences of its own outputs; adjoint ones (FMI 3.0)."""
+"""Directional derivatives of the FMU against differences of its own outputs."""
 
 import numpy as np
 import pytest
@@ -76,18 +76,3 @@ def test_seed_of_several_knowns_is_the_sum_of_columns(plant) -> None:
     np.testing.assert_allclose(
         together, jacobian(plant, UNKNOWNS, KNOWNS) @ seed, rtol=1e-12, atol=1e-9
     )
-
-
-@pytest.mark.parametrize("switches", SWITCHES, ids=str)
-@pytest.mark.parametrize("initialising", [True, False])
-def test_adjoint_is_the_transposed_jacobian(open_fmu, switches, initialising: bool) -> None:
-    knowns = [v.name for v in REALS if v.kind in (Kind.INPUT, Kind.TUNABLE, Kind.FIXED, Kind.STATE)]
-    instance = open_fmu(3)
-    instance.set(seed=2, X2_start=31.0, P100=250.0, **switches)
-    instance.enter_initialisation()
-    if not initialising:
-        instance.fmu.exitInitializationMode()
-    of, by = ([EVAPORATOR.value_reference(name) for name in names] for names in (UNKNOWNS, knowns))
-    for row, unit in zip(jacobian(instance, UNKNOWNS, knowns), np.eye(len(of)), strict=True):
-        found = instance.fmu.getAdjointDerivative(of, by, list(unit), nSensitivity=len(by))
-        np.testing.assert_allclose(list(found), row, rtol=1e-12, atol=1e-12)

@@ -75,7 +75,6 @@ FMI3 = {
     "GetFMUState": (ALL, (byref(c_void_p()),)),
     "FreeFMUState": (ALL, (byref(c_void_p()),)),
     "GetDirectionalDerivative": (READABLE, (none, zero, none, zero, None, zero, None, zero)),
-    "GetAdjointDerivative": (READABLE, (none, zero, none, zero, None, zero, None, zero)),
     "UpdateDiscreteStates": ({"event"}, (*[byref(told)] * 5, byref(moment))),
     "EvaluateDiscreteStates": ({"initialization", "event"}, ()),
     "EnterContinuousTimeMode": ({"event"}, ()),

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ModelError, ModelWarning, warn
+from controllers.problem import Problem
 from cosim.protocols import Matrix
-
-if TYPE_CHECKING:
-    from controllers.problem import Problem
 
 Mask = NDArray[np.bool_]
 
@@ -148,12 +146,12 @@ def measure_integration(problem: Problem) -> Integration:
     )
 
 
-def check_integration(problem: Problem) -> None:
+def check_integration(problem: Problem) -> Integration:
     """Refuse a prediction that is unstable where the model is not; warn where it is coarse.
 
     Raises ModelError at a mode that decays in the model and grows in the prediction.
     """
-    found, model = problem.integration, problem.model
+    found, model = measure_integration(problem), problem.model
     if found.unstable:
         raise ModelError(
             f"model '{model.name}' is too stiff for substeps = {problem.substeps}: at the "
@@ -169,6 +167,7 @@ def check_integration(problem: Problem) -> None:
             f"{found.state}; {found.remedy}",
             ModelWarning,
         )
+    return found
 
 
 def _points(problem: Problem) -> Matrix:

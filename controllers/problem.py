@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError, OptimumError
-from controllers.integration import Integration, measure_integration
 from controllers.model import Model
 from controllers.qp import FIXED, MEANING, SETTINGS
 from cosim.modules import exception_line, load_plugin
@@ -334,11 +333,6 @@ class Problem:
     def units(self) -> Units:
         """Orders of magnitude of states, actions and cost."""
         return Units.of(self)
-
-    @cached_property
-    def integration(self) -> Integration:
-        """How accurate the prediction of a sample is, measured on first use."""
-        return measure_integration(self)
 
     @cached_property
     def scale(self) -> Scale:

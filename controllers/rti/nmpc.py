@@ -640,7 +640,7 @@ class RtiNmpc:
 
     def _hint(self) -> str:
         """What may be the cause of a QP without a solution: a coarse integration."""
-        integration = self.problem.integration
+        integration = self._functions.integration
         return f"; the model is integrated coarsely: {integration.remedy}" * integration.coarse
 
     @property

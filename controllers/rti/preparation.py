@@ -592,7 +592,7 @@ class SampleFunctions:
     def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
         if hessian not in HESSIANS:
             raise ControllerError(f"there is no Hessian '{hessian}'{instead(hessian, HESSIANS)}")
-        check_integration(problem)
+        self.integration = check_integration(problem)
         self.problem, self.blocks = problem, blocks
         self.preparation = preparation(problem, blocks)
         self.readout = readout(problem, blocks, self.preparation)

@@ -34,11 +34,11 @@ class StackedFunction:
     """A CasADi function of expressions whose arguments and results live in fixed NumPy arrays.
 
     `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
-    read the results by `part`, or `matrix`. A call allocates nothing. All results share one flat array, `stack`,
-    so that one copy keeps them all. The inputs follow each other in one array but for the `shared`
-    ones, which are read from other memory, such as another function's output. Own inputs
-    and results are one array, `memory`: a given one, or one with `room` behind them for more, by
-    name and size; `places` are slices of it by name, `slices` the results' in `stack`. The
+    read the results by `part`, or `matrix`. A call allocates nothing. All results share one flat
+    array, `stack`, so that one copy keeps them all. The inputs follow each other in one array but
+    for the `shared` ones, which are read from other memory, such as another function's output. Own
+    inputs and results are one array, `memory`: a given one, or one with `room` behind them for
+    more, by name and size; `places` are slices of it by name, `slices` the results' in `stack`. The
     expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
     """
 

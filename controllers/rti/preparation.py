@@ -19,7 +19,6 @@ from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
 from cosim.protocols import Vector
 from cosim.validation import instead
 
-
 RESIDUAL = 1e-8
 """Largest KKT residual of a QP that counts as solved."""
 TINY = 1e-30
@@ -387,7 +386,7 @@ def _residual(
     What is left of the optimality conditions is, with σ_j the largest of |L w + q|_j, |Bᵀχ|_j,
     |ν_j| and the curvature of one step, the largest of
 
-        |L w + q + Bᵀχ + ν|_j / σ_j,    |v − clip(v + ν/σ)|_j,    |y − prox(y + λ/w)|_i / (1 + |y_i|)
+        |L w + q + Bᵀχ + ν|_j / σ_j,  |v − clip(v + ν/σ)|_j,  |y − prox(y + λ/w)|_i / (1 + |y_i|)
 
     with y = ξ_{k+1}. The last is that of the soft bound Σ t + (W/w) t², with its `limits`: lower,
     upper, w and W (n,), undiscounted; feasibility, sign and complementarity at once. All are zero
@@ -432,8 +431,8 @@ def _residual(
 class Spectrum:
     """Eigenvalues (N, s) and eigenvectors (N, s, s) of the blocks before they were lifted.
 
-    The blocks are those of steps `ranges` (s,) of (x, u), with costs relative to a level: eigenvalues
-    then have no unit, and the lift is the same in every unit. `floor` (N, 1) is theirs.
+    The blocks are those of steps `ranges` (s,) of (x, u), with costs relative to a level: their
+    eigenvalues have no unit, and the lift is the same in every unit. `floor` (N, 1) is theirs.
     """
 
     values: Vector
@@ -511,8 +510,9 @@ class Exact(GaussNewton):
     P lifts the eigenvalues of each stage's block to at least γᵏ·`FLOOR`, so that the QP keeps its
     stage structure and is strictly convex. They are those of the block over the ranges of (x, u)
     and relative to the level of the cost in `Problem.scale`, so P is the same in every unit. The
-    floor does not depend on θ, so that P can be differentiated. The terminal cost has no curvature of the model and stays as it is. Where
-    `lifts` is false P is the identity, and the QP may be indefinite.
+    floor does not depend on θ, so that P can be differentiated. The terminal cost has no curvature
+    of the model and stays as it is. Where `lifts` is false P is the identity, and the QP may be
+    indefinite.
     """
 
     source = "exact.h"

@@ -348,7 +348,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             costate += lam[:, k - 1]
         chi.insert(0, costate)
     limits = (lower, upper, w_sigma, W_sigma)
-    discounts = gamma ** np.arange(1, horizon + 1)
+    discounts = [gamma**k for k in range(1, horizon + 1)]
     u_s = ca.DM(problem.reference_action)
     actions = v * ca.repmat(action, 1, horizon)
     states = [part * state for part in xi]
@@ -378,7 +378,7 @@ def _residual(
     xi: Sequence[ca.SX],
     chi: Sequence[ca.SX],
     limits: Sequence[ca.SX],
-    discounts: Vector,
+    discounts: Sequence[float],
 ) -> ca.SX:
     """How far a solution is from optimal, without a unit and without what condensing rounds off.
 
@@ -414,7 +414,7 @@ def _residual(
         moved = v[:, k] + nu[:, k] / size
         clipped = ca.fmin(ca.fmax(moved, given["lower"][:, k]), given["upper"][:, k])
         parts.append(ca.fabs(v[:, k] - clipped))
-        y, share = xi[k + 1], lam[:, k] / (float(discounts[k]) * w_sigma)
+        y, share = xi[k + 1], lam[:, k] / (discounts[k] * w_sigma)
         nearest = ca.fmin(ca.fmax(y + share, lower), upper)
         beyond = y + share - nearest
         shrunk = ca.fmax(ca.fabs(beyond) - 1, 0) / (1 + 2 * W_sigma / w_sigma)

@@ -24,7 +24,8 @@ class ConvergedNmpc(RtiNmpc):
     of Fully Converged NMPC): at the solution the QP with the exact Hessian has the programme's KKT
     matrix. SQP on that QP converges quadratically; where it is not convex the Hessian is lifted.
     Every step is a full one. `tolerance` is on the largest change of states, actions and, relative
-    to 1 + ‖χ‖∞, costates, all in units of `Problem.scale`; QpError where `iterations` do not reach it.
+    to 1 + ‖χ‖∞, costates, all in units of `Problem.scale`; QpError where `iterations` do not reach
+    it.
     """
 
     name = "converged"

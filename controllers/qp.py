@@ -425,8 +425,8 @@ def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
     min_(v,τ)  ½ vᵀH v + fᵀv + wᵀt + tᵀ diag(W) t
     s.t.       Γ v + t ≥ row_lower,   Γ v − t ≤ row_upper,   lower ≤ v ≤ upper,   τ ≥ 0
 
-    with the slack t_i = τ_i h/w_i in units of such a size, h = max_j H_jj, that its price is h: ProxQP
-    takes QPs for infeasible whose prices are many times their curvature.
+    with the slack t_i = τ_i h/w_i, h = max_j H_jj, in such units that its price is h: ProxQP takes
+    QPs for infeasible whose prices are many times their curvature.
     """
     import qpsolvers  # noqa: PLC0415
     import scipy.sparse as sp  # noqa: PLC0415

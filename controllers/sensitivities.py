@@ -53,7 +53,7 @@ def _theta_part(
     return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
 
 
-def sensitivities(
+def sensitivities(  # noqa: PLR0915
     problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
     """Gradient of the value in θ, and a maker of its derivatives along the KKT adjoints.
@@ -78,10 +78,8 @@ def sensitivities(
     guess = ca.SX.sym("guess", n, horizon)
     extra = {"M": M, "guess": guess} if exact else {}
     scaled = {name: ca.SX.sym(name, *y[name].shape) for name in ("v", "lam")}
-    in_model_units = [
-        scaled["v"] * ca.repmat(action, 1, horizon),
-        scaled["lam"] * ca.repmat(price, 1, horizon),
-    ]
+    units = ca.repmat(action, 1, horizon), ca.repmat(price, 1, horizon)
+    in_model_units = [scaled["v"] * units[0], scaled["lam"] * units[1]]
     part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
     gradient = ca.gradient(part, symbols["theta"])
     if "p" in blocks:

@@ -379,7 +379,7 @@ def _residual(
     xi: Sequence[ca.SX],
     chi: Sequence[ca.SX],
     limits: Sequence[ca.SX],
-    discounts: Vector,
+    discounts: Sequence[float],
 ) -> ca.SX:
     """How far a solution is from optimal, without a unit and without what condensing rounds off.
 
@@ -387,7 +387,7 @@ def _residual(
     What is left of the optimality conditions is, with σ_j the largest of |L w + q|_j, |Bᵀχ|_j,
     |ν_j| and the curvature of one step, the largest of
 
-        |L w + q + Bᵀχ + ν|_j / σ_j,    |v − clip(v + ν/σ)|_j,    |y − prox(y + λ/w)|_i / (1 + |y_i|)
+        |L w + q + Bᵀχ + ν|_j / σ_j,  |v − clip(v + ν/σ)|_j,  |y − prox(y + λ/w)|_i / (1 + |y_i|)
 
     with y = ξ_{k+1}. The last is that of the soft bound Σ t + (W/w) t², with its `limits`: lower,
     upper, w and W (n,), undiscounted; feasibility, sign and complementarity at once. All are zero
@@ -415,7 +415,7 @@ def _residual(
         moved = v[:, k] + nu[:, k] / size
         clipped = ca.fmin(ca.fmax(moved, given["lower"][:, k]), given["upper"][:, k])
         parts.append(ca.fabs(v[:, k] - clipped))
-        y, share = xi[k + 1], lam[:, k] / (float(discounts[k]) * w_sigma)
+        y, share = xi[k + 1], lam[:, k] / (discounts[k] * w_sigma)
         nearest = ca.fmin(ca.fmax(y + share, lower), upper)
         beyond = y + share - nearest
         shrunk = ca.fmax(ca.fabs(beyond) - 1, 0) / (1 + 2 * W_sigma / w_sigma)
@@ -432,8 +432,8 @@ def _residual(
 class Spectrum:
     """Eigenvalues (N, s) and eigenvectors (N, s, s) of the blocks before they were lifted.
 
-    The blocks are those of steps `ranges` (s,) of (x, u), with costs relative to a level: eigenvalues
-    then have no unit, and the lift is the same in every unit. `floor` (N, 1) is theirs.
+    The blocks are those of steps `ranges` (s,) of (x, u), with costs relative to a level: their
+    eigenvalues have no unit, and the lift is the same in every unit. `floor` (N, 1) is theirs.
     """
 
     values: Vector
@@ -511,8 +511,9 @@ class Exact(GaussNewton):
     P lifts the eigenvalues of each stage's block to at least γᵏ·`FLOOR`, so that the QP keeps its
     stage structure and is strictly convex. They are those of the block over the ranges of (x, u)
     and relative to the level of the cost in `Problem.scale`, so P is the same in every unit. The
-    floor does not depend on θ, so that P can be differentiated. The terminal cost has no curvature of the model and stays as it is. Where
-    `lifts` is false P is the identity, and the QP may be indefinite.
+    floor does not depend on θ, so that P can be differentiated. The terminal cost has no curvature
+    of the model and stays as it is. Where `lifts` is false P is the identity, and the QP may be
+    indefinite.
     """
 
     source = "exact.h"

@@ -1,4 +1,4 @@
-"""Right, or a refusal: random problems in random units against a solver that shares nothing with ours.
+"""Right, or a refusal: random problems in random units against a solver of the tests' own.
 
 `tests.helpers.random_problems` has the problems and the solver, which takes the QP stage by stage.
 """
@@ -16,7 +16,7 @@ from tests.helpers.compiled import CompiledController
 from tests.helpers.random_problems import Case, InUnits, Oracle
 
 VALUE, ACTION, SLOPE = 1e-7, 1e-6, 1e-6
-"""Errors that count as right: of V relative to 1 + |V|, of π to its range, of derivatives to the largest."""
+"""Errors that count as right: of V to 1 + |V|, of π to its range, of derivatives to the largest."""
 REFERENCE = 1e-10
 """Residual above which the other solver's answer is no reference."""
 HESSIANS = ("gauss-newton", "exact")
@@ -107,7 +107,7 @@ def check_slopes(given, oracle, nmpc):
         def ends(read, h=h):
             return (8 * (read(h) - read(-h)) - (read(2 * h) - read(-2 * h))) / (12 * h)
 
-        def others(h, a=a):
+        def others(h, a=a, base=base):
             answer = oracle.solve(theta + h * direction, drawn.s, a)
             assume(answer.residual < REFERENCE and answer.active == base.active)
             return np.append(answer.action, answer.value)
@@ -150,21 +150,20 @@ def answers_of(solution, given):
 
 
 def check_units(case, make):
-    """The same problem in units of size one and in the case's: the same answers, or two refusals."""
+    """The same problem in units of size one and in the case's: the same answers, or refusals."""
     plain = InUnits(Case(**{**vars(case), "decades": (), "cost_decade": 0.0}))
     other = InUnits(case)
     drawn, seen = plain.drawn, []
-    for given in (plain, other):
-        nmpc, said = make(given), []
+    for counted in (plain, other):
+        nmpc, said = make(counted), []
         for a in (None, drawn.a):
             try:
-                solution = nmpc.feedback(
-                    drawn.s * given.state, None if a is None else a * given.action
-                )
+                enforced = None if a is None else a * counted.action
+                solution = nmpc.feedback(drawn.s * counted.state, enforced)
             except QpError as error:
                 said.append(error.status)
                 continue
-            said.append((answers_of(solution, given), solution.weakly_active, solution.licq))
+            said.append((answers_of(solution, counted), solution.weakly_active, solution.licq))
         seen.append(said)
     for one, two in zip(*seen, strict=True):
         if isinstance(one, str) or isinstance(two, str):

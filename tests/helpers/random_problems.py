@@ -283,7 +283,9 @@ class Oracle:
             stages.append((A, B, r, L, q, constant))
         return stages
 
-    def solve(self, theta: np.ndarray, s: np.ndarray, a: np.ndarray | None = None) -> Answer:
+    def solve(  # noqa: PLR0915
+        self, theta: np.ndarray, s: np.ndarray, a: np.ndarray | None = None
+    ) -> Answer:
         """V(s), or Q(s, a)."""
         drawn, case = self._given.drawn, self._given.case
         block, n, m, N = self.blocks_of(theta), case.n, case.m, case.horizon

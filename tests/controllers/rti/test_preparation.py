@@ -84,7 +84,8 @@ def test_the_linear_model_touches_the_nonlinear_one_at_its_point(functions, case
         scale = problem.scale
         xi = (point.x[k] - problem.reference_state) / scale.state
         v = (point.u[k] - problem.reference_action) / scale.action
-        linear = A[k] @ xi + B[k] @ v + prepared.matrix("r")[k] + problem.reference_state
+        linear = (A[k] @ xi + B[k] @ v + prepared.matrix("r")[k]) * scale.state
+        linear += problem.reference_state
         exact = f(point.x[k], point.u[k], problem.model.nominal_disturbance, p)
         np.testing.assert_allclose(linear, np.array(exact).ravel() + parameters["c_f"], rtol=1e-13)
 
@@ -126,5 +127,8 @@ def test_embedding_puts_the_state_into_gradient_and_limits(functions, case, prob
     x = simulate(prepared, xi_0, v)[1:] * problem.scale.state + problem.reference_state
     for side, bound in (("lower", "x_l"), ("upper", "x_u")):
         np.testing.assert_allclose(
-            (y - embed.part(side)).reshape(N, n), x - parameters[bound], rtol=0, atol=1e-10
+            (y - embed.part(side)).reshape(N, n) * problem.scale.state,
+            x - parameters[bound],
+            rtol=0,
+            atol=1e-10,
         )

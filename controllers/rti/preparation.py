@@ -365,7 +365,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_x": ca.horzcat(*(part + x_s for part in states[1:])),
             "next_u": ca.horzcat(actions[:, 1:], actions[:, -1]) + ca.repmat(u_s, 1, horizon),
             "next_chi": ca.horzcat(*(part / gamma for part in costates[2:]), costates[-1]),
-            "residual": _residual(given, xi, chi, limits, discounts),
+            "residual": _residual(given, xi, chi, limits, discounts.tolist()),
         },
         {name: prepared.part(name) for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")},
         room={"f": horizon * m}

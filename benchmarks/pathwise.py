@@ -19,9 +19,9 @@ from benchmarks.model_based import asked, greedy
 from controllers import compile_functions
 from controllers.factories import nmpc, optimal
 from cosim.plant import FmuPlant
-from learning.model_based import BURN, FINE, RECENT, BackOffs, ModelBased
+from learning.model_based import BackOffOnModel, ModelBased
 from learning.step import clip_eigenvalues, smallest_eigenvalue
-from learning.training import begin
+from learning.training_run import begin
 
 ROUNDS, SAMPLES = 12, 3300
 DAMPINGS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
@@ -32,10 +32,10 @@ STEP = 1e-4
 """Of central differences, in the units of (s, a)."""
 
 
-def gradient(problem, controller, inputs, model, costs, picks):
+def gradient(problem, controller, inputs, model, costs, picks, burn_in):
     """dJ/dθ (n_θ,) and M (n_θ, n_θ) at the controller's θ, along its rollout's inputs (s, a).
 
-    `costs` are the model's `ExpectedCosts`.
+    `costs` are the model's `ExpectedCosts`; the first `burn_in` samples do not count.
     """
     n, count, jacobians = problem.n_states, len(inputs), []
     controller.reset()
@@ -55,22 +55,24 @@ def gradient(problem, controller, inputs, model, costs, picks):
     X, slope, metric = np.zeros((n, controller.theta.size)), 0.0, 0.0
     for k, (by_state, by_theta) in enumerate(jacobians):
         U = by_state @ X + by_theta
-        if k >= BURN:
+        if k >= burn_in:
             slope = slope + cost[k, :n] @ X + cost[k, n:] @ U
             metric = metric + by_theta.T @ R @ by_theta
         X = F[k, :, :n] @ X + F[k, :, n:] @ U
-    return slope / (count - BURN), metric / (count - BURN)
+    return slope / (count - burn_in), metric / (count - burn_in)
 
 
-def descend(problem, controller, search, rollout, model, start, theta, rng, without):
-    """θ after `ROUNDS` of steps that the model promises to pay."""
+def descend(problem, controller, search, rollout, model, start, theta, rng, without, settings):
+    """θ after `ROUNDS` of steps that by the model pay."""
     radius = RADIUS
     least = 0.5 * smallest_eigenvalue(controller.parameters.blocks, theta)
     for number in range(ROUNDS):
         picks = rng.integers(len(model.residuals), size=SAMPLES, dtype=np.int32)
         ((inputs, _, _),) = rollout([theta], start, model, picks)
         controller.theta = theta
-        slope, metric = gradient(problem, controller, inputs, model, search._costs, picks)
+        slope, metric = gradient(
+            problem, controller, inputs, model, search._costs, picks, settings.burn_in
+        )
         w, V = np.linalg.eigh(metric)
         if without == "gradient":
             slope = V @ (np.sqrt(np.maximum(w, 0.0)) * rng.normal(size=w.size))
@@ -81,17 +83,17 @@ def descend(problem, controller, search, rollout, model, start, theta, rng, with
                 step = p * length / np.sqrt(p @ metric @ p)
                 thetas.append(clip_eigenvalues(controller.parameters.blocks, theta + step, least))
                 lengths.append(length)
-        search.draw(FINE)
-        costs = [one.cost for one in search.promises(thetas)]
+        search.draw(settings.fine_rollout)
+        costs = [predicted.cost for predicted in search.predicted_costs(thetas)]
         best = int(np.argmin(costs))
-        print(f"round {number + 1:2d}: the model promises {costs[0]:.2f} -> {costs[best]:.2f}")
+        print(f"round {number + 1:2d}: the model predicts {costs[0]:.2f} -> {costs[best]:.2f}")
         theta, radius = thetas[best], lengths[best]
     return theta
 
 
 def main() -> None:
     """Operate, descend on the model, and print greedy J before and after."""
-    without, run = asked(__doc__, 1440, ("nothing", "gradient"))
+    without, run = asked(__doc__, 1440, {"nothing": {}, "gradient": {}})
     scenario = run.scenario
     with FmuPlant(scenario) as plant:
         loop = begin(run, ModelBased, plant)
@@ -99,13 +101,14 @@ def main() -> None:
         for _ in range(run.samples):
             loop.advance()
         rule, before, rng = loop.algorithm, loop.parameters, np.random.default_rng(1)
-    model, (latest, _) = rule._data.fit(), rule._data.latest(RECENT)
+    settings = run.configuration
+    model, (latest, _) = rule._data.fit(), rule._data.latest(settings.recent_samples)
     problem, controller = rule._problem, nmpc(scenario, before)
     compile_functions(controller)
-    search = BackOffs(problem, rule._rollout, before, model, latest, 0.0, rng)
+    search = BackOffOnModel(problem, rule._rollout, before, model, latest, settings, rng)
     start = latest[-1, : problem.n_states]
     loops = search, rule._rollout, model
-    after = descend(problem, controller, *loops, start, before.theta, rng, without)
+    after = descend(problem, controller, *loops, start, before.theta, rng, without, settings)
     best = greedy(scenario, optimal(scenario))
     for name, theta in (("model-based", before.theta), ("and the gradient", after)):
         controller.theta = theta

@@ -18,7 +18,7 @@ from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from learning.actor_critic import ActorCritic
-from learning.training import begin, prepare
+from learning.training_run import begin, make_run
 
 SEEDS, STEPS, BURN, DIFFERENCE = range(700_000, 700_004), 5300, 300, 0.05
 BATCHES = {1000: 100, 4000: 40, 16_000: 12}
@@ -65,10 +65,11 @@ def main() -> None:
     for factor in DEVIATIONS:
         for size, count in BATCHES.items():
             options = {"seed": 7000, "start": chosen.start}
-            run = prepare("actor-critic", scenario, size * count, {"batch_size": size}, options)
+            settings = {"batch_size": size}
+            run = make_run("actor-critic", scenario, size * count, settings, **options)
             deviation = tuple(factor * run.configuration.deviation(scenario))
             settings = {"batch_size": size, "exploration_deviation": deviation}
-            run = prepare("actor-critic", scenario, size * count, settings, options)
+            run = make_run("actor-critic", scenario, size * count, settings, **options)
             with FmuPlant(scenario) as plant:
                 loop = begin(run, Estimates, plant)
                 compile_functions(loop.controller, run.samples)

@@ -37,7 +37,7 @@ DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F", "tuned": "#E69F00", "converged": "#CC79A7", "optimal": "#111111",
     "q-learning": "#0072B2", "batch-q-learning": "#009E73", "actor-critic": "#D55E00",
-    "search": "#882255", "held": "#999933", "model-based": "#44AA99", "dyna": "#332288",
+    "held": "#999933", "model-based": "#44AA99", "dyna": "#332288",
     "offset-free": "#AA4499", "identified": "#117733", "policy-search": "#661100",
     "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9", "learnt": "#56B4E9",
 }  # fmt: skip
@@ -101,16 +101,16 @@ class Look(NamedTuple):
 def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Look]:
     """A look for each controller or case, in the order given.
 
-    Cases of one rule, `rule(start=naive)`, `search+rule` and `rule-simulator`, share a colour and
-    differ in their line style; so do `case-SCENARIO` of several `scenarios`. Known rules have
-    colours of their own, the same in all sets.
+    Cases of one rule, `rule` and `rule(start=naive)`, share a colour and differ in their line
+    style; so do `case-SCENARIO` of several `scenarios`. Known rules have colours of their own, the
+    same in all sets.
     """
-    head_of = {name: name.partition("(")[0].removeprefix("search+") for name in names}
+    head_of = {name: name.partition("(")[0] for name in names}
     for name, scenario in product(names, scenarios):
         head_of[name] = head_of[name].removesuffix(f"-{scenario}")
     for name, head in head_of.items():
         rules = [known for known in _KNOWN if f"{head}-".startswith(f"{known}-")]
-        head_of[name] = max(rules, key=len, default=head.removesuffix("-simulator"))
+        head_of[name] = max(rules, key=len, default=head)
     heads = dict.fromkeys(head_of.values())
     others = cycle(_OTHERS)
     color = {head: _KNOWN.get(head) or next(others) for head in heads}

@@ -20,13 +20,19 @@ from cosim.studies.run import EVALUATION, GREEDY, LOG, PARAMETERS, Noise, Run, s
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training import HELD_OUT, prepare
+from learning.evaluator import HELD_OUT
+from learning.training_run import make_run
 
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS = "trajectories", "logs"
 """Folders of what a study keeps of its runs."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
+TRAINING_OPTIONS = (
+    "log_every", "evaluate_every", "checkpoint_every", "evaluation_seeds", "evaluation_steps",
+    "divergence", "rest_after",
+)  # fmt: skip
+"""What a case's table `training` may say."""
 T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
 
@@ -252,9 +258,9 @@ class Study:
         curves, samples = self.held_out(scenario), case.samples
         if marks := self.marks(scenario):
             samples = marks[-1]
-            if (asked := load_algorithm(case.algorithm).asks_for) != "operation":
+            if (asked := load_algorithm(case.algorithm).requires) != "operation":
                 raise ConfigurationError(
-                    f"case '{case.name}': '{case.algorithm}' asks for a {asked}, and a study in "
+                    f"case '{case.name}': '{case.algorithm}' requires a {asked}, and a study in "
                     "operation has none"
                 )
         between = max(1, samples // self.table.curves.points)
@@ -263,6 +269,7 @@ class Study:
         own = {"seed": seed, "controller": case.nmpc, "start": self.located(case.start)}
         if twice := sorted(own.keys() & case.training):
             raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
+        _check_known(case.training, TRAINING_OPTIONS, "training", "option")
         options = {
             **own,
             "log_every": log_every,
@@ -310,7 +317,13 @@ def plan(study: Study) -> Plan:
             if ":" in (case.controller or ""):
                 build_controller(case.target, scenario)
             if training is not None:
-                prepare(scenario=scenario, **training)
+                make_run(
+                    training["algorithm"],
+                    scenario,
+                    training["samples"],
+                    training["settings"],
+                    **training["options"],
+                )
             parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
             depends[case.name, name] = depends_on(scenario, *map(study.located, parts))
         facts: dict[str, Any] = {**depends[case.name, name], "fmu": plants[name]["fmu"]}

@@ -50,7 +50,7 @@ from cosim.simulation import measure, simulate
 if TYPE_CHECKING:
     import pandas as pd
 
-    from learning.training import TrainingRun
+    from learning.training_run import TrainingRun
 
 RUNS, RUN, CHECKPOINT = "runs", "run.json", "checkpoint.npz"
 TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
@@ -146,7 +146,7 @@ class Run:
     """One run of a case on a scenario: a controller, or a training with a `seed`, and its θ.
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `training` holds the other arguments of `learning`'s `prepare`: equal ones give equal
+    training. `training` holds the other arguments of `learning`'s `make_run`: equal ones give equal
     θ on any worker. `facts` are all that its results depend on, `noise` that of its evaluations, by
     the file of the results; `kept` where the study keeps a copy of a file, relative to its folder;
     `marks` the samples of operation at which θ, or the optimum, is judged.
@@ -184,9 +184,16 @@ class Run:
 
     def prepared(self) -> TrainingRun:
         """The training, checked; raises LearningError in one line."""
-        from learning.training import prepare  # noqa: PLC0415
+        from learning.training_run import make_run  # noqa: PLC0415
 
-        return prepare(scenario=self.scenario, **(self.training or {}))
+        training = self.training or {}
+        return make_run(
+            training["algorithm"],
+            self.scenario,
+            training["samples"],
+            training["settings"],
+            **training["options"],
+        )
 
     def policy(self, parameters: str = "") -> Any:
         """The controller; of a training the greedy one of the θ that a TOML text holds."""
@@ -282,7 +289,8 @@ def perform(item: Item) -> tuple[Item, Outcome]:
 
 def _train(run_: Run, folder: Path | None) -> Trained:
     from cosim.studies import operation  # noqa: PLC0415
-    from learning.training import COLUMNS, LogRow, run_training, to_csv  # noqa: PLC0415
+    from learning.log import COLUMNS, LogRow, to_csv  # noqa: PLC0415
+    from learning.training import run_training  # noqa: PLC0415
 
     run, marks, begin = run_.prepared(), run_.marks, time.perf_counter()
     clock: Mapping[int, float] = {}

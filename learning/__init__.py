@@ -16,7 +16,7 @@ from learning.errors import (
     LearningError,
     PrivilegeError,
 )
-from learning.loop import Strategy
+from learning.exploration import Strategy
 from learning.q_learning import QLearning
 from learning.step import ConstrainedStep, td_step
 

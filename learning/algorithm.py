@@ -5,7 +5,7 @@ The loop of plant, controller and rule is `learning.loop`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -17,9 +17,7 @@ from cosim.validation import suggestion
 from learning.checkpoint import State
 from learning.configuration import Configuration
 from learning.errors import AlgorithmLookupError
-
-if TYPE_CHECKING:
-    from learning.loop import Strategy
+from learning.exploration import Strategy
 
 Privilege = Literal["operation", "simulator"]
 

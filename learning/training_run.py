@@ -24,7 +24,8 @@ from learning.algorithm import Algorithm, load_algorithm
 from learning.backed_off import add_reserve, back_off
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.loop import Strategy, TrainingLoop
+from learning.exploration import Strategy
+from learning.loop import TrainingLoop
 
 DEFAULT_SAMPLES = 50_000
 """Length of a run where neither user nor algorithm states one."""

@@ -10,7 +10,8 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import Scenario
 from learning.algorithm import Algorithm, load_algorithm
-from learning.loop import Strategy, TrainingLoop
+from learning.exploration import Strategy
+from learning.loop import TrainingLoop
 from learning.training import Training, run_training
 from learning.training_run import TrainingRun
 

@@ -7,7 +7,7 @@ from controllers.theta import Parameters
 from learning import ActorCritic
 from learning.actor_critic import lstdv, regression
 from learning.algorithm import Transition
-from learning.loop import Strategy
+from learning.exploration import Strategy
 from tests.helpers.training import Carrier
 
 

@@ -9,7 +9,7 @@ from learning.back_off import BackOff
 from learning.configuration import Configuration
 from learning.dyna import Dyna
 from learning.errors import ConfigurationError
-from learning.loop import Strategy
+from learning.exploration import Strategy
 from learning.model_based import ModelBased
 
 CLASSES = (QLearning, BatchQLearning, ActorCritic, ModelBased, BackOff, Dyna)

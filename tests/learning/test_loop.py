@@ -14,7 +14,8 @@ from learning import QLearning
 from learning.algorithm import Update
 from learning.errors import PrivilegeError
 from learning.evaluator import HELD_OUT
-from learning.loop import PlantInOperation, Strategy, TrainingLoop
+from learning.exploration import Strategy
+from learning.loop import PlantInOperation, TrainingLoop
 from learning.training import run_training
 from learning.training_run import TrainingRun, begin, starting_parameters
 

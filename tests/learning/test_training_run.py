@@ -7,7 +7,7 @@ from controllers.theta import Parameters, ThetaBlocks
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.loop import Strategy
+from learning.exploration import Strategy
 from learning.training_run import make_run, starting_parameters
 
 

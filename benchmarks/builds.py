@@ -17,7 +17,8 @@ from cosim.files import replacing
 from cosim.scenario import Scenario, presets
 from fmus import PLATFORMS, Platform
 from fmus.build import cross_compiler
-from learning.empirical_model import Features, Rollout
+from learning.empirical_model import Features
+from learning.rollout import Rollout
 
 SYSTEMS = {
     "x86_64-linux": ("linux", "x86_64"),
@@ -45,6 +46,7 @@ def preset_sources() -> list[dict[str, bytes]]:
     with (
         patch("controllers.rti.nmpc.library", keep),
         patch("learning.empirical_model.library", keep),
+        patch("learning.rollout.library", keep),
     ):
         for preset in presets():
             problem = Problem.from_scenario(Scenario.load(preset))

@@ -1,6 +1,6 @@
 """Endurance: a long learning run; memory, time, failures.
 
-    python -m benchmarks.endurance --samples 1000000 [--log] [--rule-alone]
+    python -m benchmarks.endurance --samples 1000000 [--log]
 
 Trains on one plant and looks at every tenth of the run. Exit code 1 where memory grew by more than
 --megabytes after the first tenth, the last tenth cost more than --drift times the first one's CPU
@@ -24,8 +24,8 @@ from pathlib import Path
 from cosim import Scenario
 from cosim.plugins import build_controller
 from learning.q_learning import QLearning
-from learning.search import Search
-from learning.training import TrainingRun, run_training
+from learning.training import run_training
+from learning.training_run import TrainingRun
 
 TENTHS = 10
 PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -39,9 +39,7 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
 
-def endure(
-    samples: int, folder: Path, *, log: bool = False, alone: bool = False
-) -> dict[str, object]:
+def endure(samples: int, folder: Path, *, log: bool = False) -> dict[str, object]:
     """Train for `samples` samples with checkpoints; figures of each tenth of the run.
 
     Each tenth ends with an evaluation and a checkpoint, so what happens once happens in the first.
@@ -51,13 +49,11 @@ def endure(
     every = tenth // 100 if log else tenth
     scenario = Scenario.load("paper")
     run = TrainingRun(
-        algorithm="q-learning" if alone else "search",
+        algorithm="q-learning",
         scenario=scenario,
         samples=tenth * TENTHS,
         seed=0,
-        configuration=QLearning.Configuration()
-        if alone
-        else Search.Configuration(rule="q-learning"),
+        configuration=QLearning.Configuration(),
         log_every=every,
         evaluate_every=tenth,
         checkpoint_every=tenth,
@@ -72,8 +68,7 @@ def endure(
         memory.append(resident())
         failures.append(0 if row is None else int(row["failures"]))
 
-    # What is loaded once is loaded first: SciPy's LAPACK comes with the first dπ/dθ, which a search
-    # asks for when learning no longer pays.
+    # What is loaded once is loaded first: SciPy's LAPACK comes with the first dπ/dθ.
     build_controller("naive", scenario).feedback(scenario.initial_state).policy_jacobian  # noqa: B018
     look(0, None)
     result = run_training(run, folder, progress=look)
@@ -99,12 +94,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--log", action="store_true", help="a row of the log for each thousandth")
-    parser.add_argument("--rule-alone", action="store_true", help="no search around the rule")
     parser.add_argument("--megabytes", type=float, default=5.0)
     parser.add_argument("--drift", type=float, default=1.25)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        figures = endure(options.samples, Path(folder), log=options.log, alone=options.rule_alone)
+        figures = endure(options.samples, Path(folder), log=options.log)
     print(json.dumps(figures, indent=2))
     sound = (
         figures["status"] == "finished"

@@ -53,9 +53,9 @@ def step() -> Entered:
     """2400 samples of Q-learning on a plant in operation, its steps of θ included."""
     from controllers import compile_functions
     from learning.algorithm import load_algorithm
-    from learning.training import begin, prepare
+    from learning.training_run import begin, make_run
 
-    run = prepare("q-learning", cosim.Scenario.load("fouled"), 2400, None, {"seed": 0})
+    run = make_run("q-learning", cosim.Scenario.load("fouled"), 2400)
     with cosim.FmuPlant(run.scenario) as plant:
         loop = begin(run, load_algorithm(run.algorithm), plant)
         compile_functions(loop.controller, run.samples)

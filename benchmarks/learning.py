@@ -8,7 +8,7 @@ from benchmarks.measuring import clock, figure
 from controllers import compile_functions
 from cosim import FmuPlant
 from learning.algorithm import load_algorithm
-from learning.training import begin, prepare
+from learning.training_run import begin, make_run
 
 ALGORITHMS = ("q-learning", "actor-critic", "batch-q-learning")
 REPETITIONS = 20
@@ -21,7 +21,7 @@ def measure(scenario, steps):
     """Time `steps` samples of each rule in turn, compiled and interpreted, `REPETITIONS` times."""
     rows = []
     for name in ALGORITHMS:
-        run = prepare(name, scenario, SETTLING + steps * REPETITIONS, {}, {"seed": 0})
+        run = make_run(name, scenario, SETTLING + steps * REPETITIONS)
         seconds = {"now": [], "never": []}
         with ExitStack() as stack:
             loops = {}

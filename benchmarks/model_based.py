@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -23,28 +24,23 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from cosim.statistics import regrets
-from learning import empirical_model, model_based
-from learning.training import TrainingRun, begin, prepare
+from learning.model_based import ModelBased
+from learning.training_run import TrainingRun, begin, make_run
 
 PARTS = {
-    "parameters": (empirical_model, "PARAMETER_DEVIATION", 1e-6),  # W alone is fitted
-    "slopes": (empirical_model, "SLOPE_DEVIATIONS", (1e-6,)),  # c and offsets alone
-    "evidence": (empirical_model, "SLOPE_DEVIATIONS", (0.1,)),  # the widest prior of slopes
-    "rounds": (empirical_model, "ROUNDS", 2),  # two Gauss-Newton steps in place of six
-    "scale": (empirical_model, "FLOOR", 1e3),  # h is constant
-    "doubt": (model_based, "DOUBT", 0.0),  # the least promised cost, not the smallest back-off
-    "tail": (model_based, "TAIL", 0.0),
-    "caution": (model_based, "CAUTION", 0),
-    "steadiness": (model_based, "STEADY", 0),  # on a changed plant back-offs shrink at once
-    "reach": (model_based, "REACH", 1e9),  # a rollout is lost by its cost alone
-    "promise": (model_based, "BROKEN", 1e9),  # no promise is ever broken
-    "dropping": (empirical_model, "EVIDENCE", np.inf),  # the fit uses all data
-    "offset": (
-        empirical_model.EmpiricalModel,
-        "lack",
-        lambda model, inputs, c: inputs[0, : model.features.outputs - 1] * 0.0,
-    ),
-    "nothing": (model_based, "CAUTION", model_based.CAUTION),
+    "parameters": {"parameter_deviation": 1e-6},  # W alone is fitted
+    "slopes": {"slope_deviations": [1e-6]},  # c and offsets alone
+    "evidence": {"slope_deviations": [0.1]},  # the widest prior of slopes
+    "rounds": {"fit_rounds": 2},  # two Gauss-Newton steps in place of six
+    "scale": {"smallest_error_size": 1e3},  # h is constant
+    "doubt": {"doubt": 0.0},  # the least predicted cost, not the smallest back-off
+    "tail": {"tail_widening": 0.0},
+    "caution": {"least_samples": 1},
+    "steadiness": {"steady_samples": 1},  # on a changed plant back-offs shrink at once
+    "reach": {"state_ranges": 1e9},  # a rollout is lost by its cost alone
+    "prediction": {"cost_excess": 1e9},  # no sample costs more than was predicted
+    "dropping": {"forecast_evidence": 1e9},  # the fit uses all data
+    "nothing": {},
 }
 SEEDS, STEPS, BURN = range(700_000, 700_005), 1300, 300
 
@@ -60,8 +56,10 @@ def greedy(scenario: Scenario, controller: Controller) -> float:
     return float(np.mean(costs))
 
 
-def asked(about: str | None, samples: int, parts: Iterable[str]) -> tuple[str, TrainingRun]:
-    """The part to take out and the run of `model-based`, of so many samples, from the arguments."""
+def asked(
+    about: str | None, samples: int, parts: Mapping[str, Mapping[str, Any]]
+) -> tuple[str, TrainingRun]:
+    """The part to take out, and the run of `model-based` without it, from the arguments."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("scenario")
     parser.add_argument("start")
@@ -70,21 +68,20 @@ def asked(about: str | None, samples: int, parts: Iterable[str]) -> tuple[str, T
     parser.add_argument("--without", choices=parts, default="nothing")
     parser.add_argument("--parameters", nargs="*", default=["all"], help="of the model, in θ")
     chosen = parser.parse_args()
-    settings = {"model_parameters": chosen.parameters}
+    settings = {"model_parameters": chosen.parameters, **parts[chosen.without]}
     options = {"seed": chosen.seed, "start": chosen.start}
     scenario = Scenario.load(chosen.scenario)
-    return chosen.without, prepare("model-based", scenario, chosen.samples, settings, options)
+    return chosen.without, make_run("model-based", scenario, chosen.samples, settings, **options)
 
 
 def main() -> None:
     """Run one trajectory and print a line for each update."""
     without, run = asked(__doc__, 960, PARTS)
-    setattr(*PARTS[without])
     scenario, samples = run.scenario, run.samples
     best: dict[str, float] = {}
     costs: list[float] = []
     with FmuPlant(scenario) as plant:
-        loop = begin(run, model_based.ModelBased, plant)
+        loop = begin(run, ModelBased, plant)
         judged = nmpc(scenario, loop.parameters)
         compile_functions(loop.controller, samples)
         print(f"{scenario.name} from {run.start}, seed {run.seed}, -{without}")

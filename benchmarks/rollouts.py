@@ -6,7 +6,8 @@ from benchmarks.measuring import clock, figure
 from controllers import Problem
 from controllers.factories import tuned
 from cosim import FmuPlant, simulate
-from learning.empirical_model import EmpiricalModel, Features, Rollout
+from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
+from learning.rollout import Rollout
 
 TAUGHT, SHORTER, REPETITIONS, TARGET = 480, 200, 5, 15.0
 
@@ -21,7 +22,9 @@ def measure(scenario, steps):
         [run[name] for name in (*scenario.plant.states, *scenario.plant.actions)]
     )
     outputs = np.column_stack([inputs[1:, : problem.n_states], run["stage_cost"][:-1]])
-    model = EmpiricalModel.fit(features, inputs[:-1], outputs)
+    model = EmpiricalModel.fit(
+        features, inputs[:-1], outputs, EmpiricalModelConfiguration.from_dict({})
+    )
     start = problem.reference_state
     rollout = Rollout(problem, controller.parameters, features)
     if rollout.compiled is None:

@@ -1,13 +1,13 @@
-"""Learning of an NMPC's θ from plant data: the rules, and all that an own one needs."""
+"""Learning of an NMPC's θ from plant data: the rules, and all that a rule of one's own needs."""
 
 from typing import TYPE_CHECKING
 
 import lazy_loader
 
 from learning.actor_critic import ActorCritic
-from learning.algorithm import Algorithm, Strategy, Transition, Update, algorithms
+from learning.algorithm import Algorithm, Transition, Update, algorithms
 from learning.batch_q_learning import BatchQLearning
-from learning.checkpoint import arrays_of, take_up
+from learning.checkpoint import part_of, prefixed
 from learning.configuration import Configuration
 from learning.errors import (
     AlgorithmLookupError,
@@ -16,22 +16,27 @@ from learning.errors import (
     DivergenceError,
     LearningError,
     PrivilegeError,
-)  # fmt: skip
+)
+from learning.exploration import Strategy
 from learning.q_learning import QLearning
-from learning.search import Search
 from learning.step import ConstrainedStep, td_step
 
 if TYPE_CHECKING:
-    from learning.training import Tracker, Training, TrainingRun, train
+    from learning.training import Tracker, Training, train
+    from learning.training_run import TrainingRun
 
 __all__ = [
     "ActorCritic", "Algorithm", "AlgorithmLookupError", "BatchQLearning", "CheckpointError",
     "Configuration", "ConfigurationError", "ConstrainedStep", "DivergenceError", "LearningError",
-    "PrivilegeError", "QLearning", "Search", "Strategy", "Tracker", "Training", "TrainingRun",
-    "Transition", "Update", "algorithms", "arrays_of", "take_up", "td_step", "train",
+    "PrivilegeError", "QLearning", "Strategy", "Tracker", "Training", "TrainingRun", "Transition",
+    "Update", "algorithms", "part_of", "prefixed", "td_step", "train",
 ]  # fmt: skip
 
 # Imported on first use: half a second that a rule does not need.
 __getattr__, _, _ = lazy_loader.attach(
-    __name__, submod_attrs={"training": ["Tracker", "Training", "TrainingRun", "train"]}
+    __name__,
+    submod_attrs={
+        "training": ["Tracker", "Training", "train"],
+        "training_run": ["TrainingRun"],
+    },
 )

@@ -14,17 +14,11 @@ from controllers.errors import QpError
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from cosim.protocols import Matrix, Vector
 from learning.algorithm import Transition, Update
+from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Count
 from learning.errors import DivergenceError
-from learning.q_learning import OUTLIER, ValueConfiguration, ValueRule
+from learning.q_learning import ValueConfiguration, ValueRule
 from learning.step import Fit
-
-POINT = tuple(f"point_{name}" for name in LinearisationPoint._fields)
-NEXT_POINT = tuple(f"next_{name}" for name in POINT)
-COLUMNS = (
-    *("number", "s", "a", "explored", "cost", "next_s", "error", "correction"),
-    *POINT, *NEXT_POINT,
-)  # fmt: skip
 
 
 class BatchQLearningConfiguration(ValueConfiguration):
@@ -52,27 +46,26 @@ class BatchQLearning(ValueRule):
     """
 
     Configuration = BatchQLearningConfiguration
-    KEPT = (*ValueRule.KEPT, "_buffer", "_anchor", "_information", "_mean", "_variance")
     needs_points = True
     configuration: BatchQLearningConfiguration
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._variance = 0.0
+        self._variance = 0.0  # r; zero until the first batch is full
         longest = max(self._length, self.configuration.batch_size)
         self._buffer = ReplayBuffer(self.controller, longest)
-        self._anchor = self.controller.theta.copy()
-        self._information: Matrix = np.eye(self._anchor.size)
-        self._mean: Vector = np.zeros(self._anchor.size)
+        self._start = self.controller.theta.copy()  # θ₀
+        self._information: Matrix = np.eye(self._start.size)  # Λ
+        self._mean: Vector = np.zeros(self._start.size)  # m
 
     def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; the last of a batch moves θ."""
+        """Learn from one sample; the last of a batch moves θ."""
         prediction = self._model(transition.s, transition.a)
         error = transition.next_s - prediction
         self._errors.add(error)
         expected = self._errors.expected_penalty(prediction)
         self._buffer.add(transition, error, expected - transition.next_penalty)
-        if len(self._buffer.rows) < self._length:
+        if self._buffer.count < self._length:
             return None
         update = self._update()
         self._buffer.clear()
@@ -82,157 +75,265 @@ class BatchQLearning(ValueRule):
     def _length(self) -> int:
         """Samples of the open batch."""
         settings = self.configuration
-        first = settings.first_batch if self._variance == 0.0 else None
-        return settings.batch_size if first is None else first
+        if self._variance == 0.0 and settings.first_batch is not None:
+            return settings.first_batch
+        return settings.batch_size
 
     def _update(self) -> Update:
-        settings, update, failures = self.configuration, None, 0
+        """Replay the batch and move θ, `relinearisations` times."""
+        settings = self.configuration
+        # Each pass replays at the θ of the last step: Gauss–Newton on the posterior.
+        update: Update | None = None
+        failures = 0
         information = self._information
         for _ in range(settings.relinearisations):
-            kept, action_value, next_value, gradient = self._buffer.replay()
-            failures += len(kept) - len(action_value)
-            if not len(action_value):
+            solved, q, next_value, gradient = self._buffer.replay()
+            failures += len(solved) - len(q)
+            if not len(q):
                 break
-            cost, correction = (self._buffer.rows[name][kept] for name in ("cost", "correction"))
+            cost = self._buffer.column("cost")[solved]
+            correction = self._buffer.column("correction")[solved]
             target = self._average_cost.target(cost, next_value)
             # The next penalty is replaced by its expectation.
-            td_error = target - action_value + self._average_cost.discount * correction
+            td_error = target - q + self._average_cost.discount * correction
             if not np.isfinite(td_error).all():
                 raise DivergenceError("TD errors are not finite")
+            # Once, from the first batch: noise, widths and c_f.
             if self._variance == 0.0:
                 self._begin_filter(td_error)
-                information = self._information
-            gradient = gradient * self._step.scale
-            limit = settings.innovation_clip * self._variance**0.5
-            innovation = np.clip(td_error, -limit, limit)
-            told = gradient.T @ gradient / self._variance
-            information = self._information + told
-            slope = gradient.T @ innovation / self._variance
-            slope -= self._information @ (self._present - self._mean)
-            fit = Fit(slope, cho_solve(cho_factor(information), slope), information.copy)
-            longest = settings.largest_step or np.inf
-            share = 1.0 / max(float(np.abs(fit.minimiser).max()) / longest, 1.0)
-            information = self._information + share * told
-            fit = self._average_cost.take(fit.shrunk(share))
-            update = self._step.take(fit, float(np.sqrt(np.mean(td_error**2))))
+            fit, information = self._posterior(td_error, gradient * self._step.scale)
+            fit = self._average_cost.absorb(fit)
+            error_size = float(np.sqrt(np.mean(td_error**2)))
+            update = self._step.apply(fit, error_size)
         if update is None:
             raise DivergenceError("no transition of a batch can be replayed")
-        self._information, self._mean = information, self._present
-        squares = np.minimum(td_error**2, OUTLIER * self._variance)
+
+        # The posterior of this batch is the prior of the next.
+        self._information = information
+        self._mean = self._present
+        squares = np.minimum(td_error**2, settings.outlier * self._variance)
+        variance = float(squares.mean())
         share = min(len(td_error) / settings.variance_memory, 1.0)
-        self._variance += share * (float(squares.mean()) - self._variance)
+        self._variance += share * (variance - self._variance)
         return update._replace(failures=failures)
+
+    def _posterior(self, td_error: Vector, gradient: Matrix) -> tuple[Fit, Matrix]:
+        """The step from the present θ to the posterior's mean, and the posterior's information.
+
+        Args:
+            td_error: δ, (K,).
+            gradient: G, (K, n_θ), scaled.
+        """
+        settings = self.configuration
+        limit = settings.innovation_clip * self._variance**0.5
+        # As online: no single sample decides.
+        innovation = np.clip(td_error, -limit, limit)
+        batch_information = gradient.T @ gradient / self._variance
+        information = self._information + batch_information
+        from_prior = self._present - self._mean
+        slope = gradient.T @ innovation / self._variance
+        slope -= self._information @ from_prior
+        step = cho_solve(cho_factor(information), slope)
+        fit = Fit(slope, step, information.copy)
+        # Of a step that is too long only a share is taken, and that share of the information.
+        largest = settings.largest_step or np.inf
+        longest = float(np.abs(fit.minimiser).max())
+        share = 1.0 / max(longest / largest, 1.0)
+        return fit.shrunk(share), self._information + share * batch_information
 
     @property
     def _present(self) -> Vector:
         """d of the controller's θ."""
-        present: Vector = (self.controller.theta - self._anchor) / self._step.scale
+        present: Vector = (self.controller.theta - self._start) / self._step.scale
         return present
 
     def _begin_filter(self, td_error: Vector) -> None:
         """Take the noise, the widths and c_f from the samples of the first batch."""
-        rows = self._buffer.rows
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
-        start = self._begin(rows["s"], rows["error"], self._variance**0.5)
+        states = self._buffer.column("s")
+        errors = self._buffer.column("error")
+        start = self._begin_with_prior(states, errors, self._variance**0.5)
         self.controller.theta = start.theta
-        self._anchor = start.theta.copy()
+        self._start = start.theta.copy()
+
+    def state_dict(self) -> State:
+        """What `ValueRule` keeps, the open batch, and the posterior."""
+        return {
+            **super().state_dict(),
+            **prefixed("buffer", self._buffer.state_dict()),
+            "start": self._start,
+            "information": self._information,
+            "mean": self._mean,
+            "variance": self._variance,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        super().load_state_dict(state)
+        self._buffer.load_state_dict(part_of(state, "buffer"))
+        self._start = state["start"]
+        self._information = state["information"]
+        self._mean = state["mean"]
+        self._variance = state["variance"]
 
 
 class ReplayBuffer:
-    """Up to `capacity` transitions with their linearisation points, a record each (`COLUMNS`).
+    """Up to `capacity` transitions with their linearisation points.
 
     V and Q of a real-time iteration depend on the linearisation point, so a replay uses that of the
     loop, with the model and cost of the controller's θ. Values solved at the same θ are kept where
     the controller is `memoryless`; NaN stands for unknown ones.
     """
 
-    KEPT = ("_count", "_records", "_theta", "_action_value", "_next_value", "_gradient")
-
     def __init__(self, controller: RtiNmpc, capacity: int) -> None:
-        self._controller, self._capacity, self._count = controller, capacity, 0
-        self._records: NDArray[Any] = np.zeros(0)
-        self._theta = controller.theta
-        self._action_value, self._next_value = np.full((2, capacity), np.nan)
+        self._controller = controller
+        self._capacity = capacity
+        self.count = 0
+        self._columns: dict[str, NDArray[Any]] = {}  # arrays (capacity, …) by name
+        self._theta = controller.theta  # of the values
+        self._q = np.full(capacity, np.nan)
+        self._next_value = np.full(capacity, np.nan)
         self._gradient = np.zeros((capacity, self._theta.size))
 
-    @property
-    def rows(self) -> NDArray[Any]:
-        """The transitions kept, (K,), in time's order."""
-        return self._records[: self._count]
+    def column(self, name: str) -> NDArray[Any]:
+        """A quantity of the transitions kept, (K, …), in time's order."""
+        return self._columns[name][: self.count]
 
     def clear(self) -> None:
         """Keep no transition."""
-        self._count = 0
-        self._action_value[:] = self._next_value[:] = np.nan
+        self.count = 0
+        self._forget_values()
 
-    def add(self, transition: Transition, error: Vector, correction: float) -> None:
+    def _forget_values(self) -> None:
+        self._q[:] = np.nan
+        self._next_value[:] = np.nan
+
+    def add(
+        self,
+        transition: Transition,
+        error: Vector,
+        correction: float,
+    ) -> None:
         """Keep a transition, solved at the controller's θ.
 
-        `error` (n,) is its prediction's, `correction` the expectation of its next penalty less it.
+        Args:
+            transition: of a rule that `needs_points`.
+            error: of its prediction, (n,).
+            correction: the expectation of its next penalty less it.
         """
-        point, next_point = transition.point, transition.next_point
+        # The rule needs points, so the loop has given them.
+        point = transition.point
+        next_point = transition.next_point
         assert point is not None and next_point is not None
-        values = (
-            *(transition.number, transition.s, transition.a, transition.explored),
-            *(transition.cost, transition.next_s, error, correction, *point, *next_point),
-        )
-        if not self._records.size:
-            kept = zip(COLUMNS, map(np.asarray, values), strict=True)
-            kinds = [(name, value.dtype, value.shape) for name, value in kept]
-            self._records = np.empty(self._capacity, kinds)
-        row, self._count = self._count, self._count + 1
-        self._records[row] = values
+        values: dict[str, Any] = {
+            "number": transition.number,
+            "s": transition.s,
+            "a": transition.a,
+            "explored": transition.explored,
+            "cost": transition.cost,
+            "next_s": transition.next_s,
+            "error": error,
+            "correction": correction,
+            **prefixed("point", point._asdict()),
+            **prefixed("next_point", next_point._asdict()),
+        }
+        row = self.count
+        self.count += 1
+        for name, value in values.items():
+            array = np.asarray(value)
+            # The first transition says how long its arrays are.
+            if name not in self._columns:
+                self._columns[name] = np.zeros((self._capacity, *array.shape), array.dtype)
+            self._columns[name][row] = array
         if not self._controller.memoryless:
             return
-        self._forget_other_theta()
-        self._next_value[row] = transition.next_policy.value
+        # What the loop has solved at this θ need not be solved again.
+        self._forget_values_of_another_theta()
+        self._next_value[row] = transition.next_solution.value
         if not transition.explored:
-            self._action_value[row] = transition.policy.value
-            self._gradient[row] = transition.policy.value_gradient
+            self._q[row] = transition.solution.value
+            self._gradient[row] = transition.solution.value_gradient
 
     def replay(self) -> tuple[NDArray[np.bool_], Vector, Vector, Matrix]:
-        """Q(s, a), V(s₊) and ∇Q (unscaled) of every transition at the controller's θ.
+        """Solve the transitions at the controller's θ.
 
-        Before them which of the transitions they are of: not of those whose QP failed.
+        Returns:
+            Which of the transitions could be solved, (K,) of bool; of these Q(s, a), V(s₊) and ∇Q
+            (unscaled), (L,), (L,) and (L, n_θ).
         """
-        self._forget_other_theta()
-        now, after = self._action_value[: self._count], self._next_value[: self._count]
-        self._solve(np.flatnonzero(np.isnan(now + after)))
-        kept = np.isfinite(now) & np.isfinite(after)
-        return kept, now[kept], after[kept], self._gradient[: self._count][kept]
+        self._forget_values_of_another_theta()
+        q = self._q[: self.count]
+        next_value = self._next_value[: self.count]
+        self._solve(np.flatnonzero(np.isnan(q + next_value)))
+        # A QP that failed has left NaN.
+        solved = np.isfinite(q) & np.isfinite(next_value)
+        gradient = self._gradient[: self.count]
+        return solved, q[solved], next_value[solved], gradient[solved]
 
-    def _forget_other_theta(self) -> None:
+    def _forget_values_of_another_theta(self) -> None:
         theta = self._controller.theta
+        # Identity first: it is the common case, and the cheap one.
         same = theta is self._theta or np.array_equal(theta, self._theta)
         if not (same and self._controller.memoryless):
-            self._action_value[:] = self._next_value[:] = np.nan
+            self._forget_values()
         self._theta = theta
 
     def _solve(self, rows: NDArray[np.int64]) -> None:
         """Solve for unknown values of these rows, in time's order; a failing QP leaves NaN."""
         # V(s₊) of one transition is Q of the next: a successor shares the linearisation, and where
         # it was greedy the solution too.
-        controller, columns = self._controller, self._records
-        at: int | None = None
-        value: RtiSolution | None = None
+        controller = self._controller
+        states = self._columns["s"]
+        actions = self._columns["a"]
+        next_states = self._columns["next_s"]
         # Plain numbers: reading them one by one out of arrays costs as much as a gradient.
-        numbers, explored = (columns[name][rows].tolist() for name in ("number", "explored"))
-        points, next_points = ([columns[name] for name in names] for names in (POINT, NEXT_POINT))
+        numbers = self._columns["number"][rows].tolist()
+        explored = self._columns["explored"][rows].tolist()
+        prepared_for: int | None = None  # the sample whose linearisation the controller has
+        solution: RtiSolution | None = None  # its greedy one, if known
         for number, exploring, row in zip(numbers, explored, rows.tolist(), strict=True):
             try:
-                if isnan(self._action_value[row]):
-                    if at != number:
-                        controller.prepare_at(LinearisationPoint(*(p[row] for p in points)))
-                        value = None
+                if isnan(self._q[row]):
+                    if prepared_for != number:
+                        controller.prepare_at(self._point("point", row))
+                        solution = None
                     if exploring:
-                        value = controller.feedback(columns["s"][row], columns["a"][row])
-                    elif value is None:
-                        value = controller.feedback(columns["s"][row])
-                    self._action_value[row] = value.value
-                    self._gradient[row] = value.value_gradient
+                        solution = controller.feedback(states[row], actions[row])
+                    elif solution is None:
+                        solution = controller.feedback(states[row])
+                    self._q[row] = solution.value
+                    self._gradient[row] = solution.value_gradient
                 if isnan(self._next_value[row]):
-                    controller.prepare_at(LinearisationPoint(*(p[row] for p in next_points)))
-                    at, value = number + 1, controller.feedback(columns["next_s"][row])
-                    self._next_value[row] = value.value
+                    controller.prepare_at(self._point("next_point", row))
+                    prepared_for = number + 1
+                    solution = controller.feedback(next_states[row])
+                    self._next_value[row] = solution.value
             except QpError:
-                at = None
+                prepared_for = None
+
+    def _point(self, name: str, row: int) -> LinearisationPoint:
+        """The linearisation point `point` or `next_point` of a row."""
+        x = self._columns[f"{name}.x"][row]
+        u = self._columns[f"{name}.u"][row]
+        costates = self._columns[f"{name}.costates"][row]
+        return LinearisationPoint(x, u, costates)
+
+    def state_dict(self) -> State:
+        """The transitions, and the values solved at the present θ."""
+        return {
+            **prefixed("column", self._columns),
+            "count": self.count,
+            "theta": self._theta,
+            "q": self._q,
+            "next_value": self._next_value,
+            "gradient": self._gradient,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        self._columns = part_of(state, "column")
+        self.count = state["count"]
+        self._theta = state["theta"]
+        self._q = state["q"]
+        self._next_value = state["next_value"]
+        self._gradient = state["gradient"]

@@ -1,7 +1,7 @@
-"""Checkpoints: one file, whole or absent, checked on reading, without pickle.
+"""Checkpoints of a training: one file, whole or absent, checked on reading, without pickle.
 
-The file is an NPZ archive of plain arrays. Its entry `run` is JSON: whose state it is, and the
-state, where the name of another entry stands for an array. The archive's checksums detect damage.
+The file is an NPZ archive: an entry for each array or number of the run's `state_dict`, and in the
+entry `run` JSON that says whose state it is. The archive's checksums detect damage.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -20,96 +19,162 @@ from cosim.files import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
 State = dict[str, Any]
-"""Arrays, numbers, texts and None by name, or lists and tables of them."""
-ENTRY = "array"
-"""Only key of a table in the JSON that stands for an array."""
+"""A `state_dict`: arrays and numbers by name. Names of a part begin with the part's and a dot."""
+RUN = "run"
+"""Entry of the archive that identifies the run."""
+STATE = "state"
+"""Prefix of the entries of the state."""
 
 
-def save(path: Path, run: Mapping[str, Any], state: State) -> Path:
+def save(
+    path: Path,
+    run: Mapping[str, Any],
+    state: State,
+) -> Path:
     """Write the state of a run under a temporary name and rename it.
 
-    `run` identifies it. Raises OSError, CheckpointError.
+    Args:
+        path: the checkpoint's file.
+        run: what identifies the run, JSON-ready.
+        state: arrays and numbers by name.
+
+    Returns:
+        The path.
+
+    Raises:
+        CheckpointError: a value is neither an array nor a number.
+        OSError: the file cannot be written.
     """
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def entry(value: Any) -> Any:
-        if isinstance(value, np.generic):
-            return value.item()
-        if not isinstance(value, np.ndarray) or value.dtype.hasobject:
-            raise CheckpointError(f"a checkpoint holds numbers, texts and arrays, not {value!r}")
-        arrays[name := f"{ENTRY} {len(arrays)}"] = value
-        return {ENTRY: name}
-
-    document = json.dumps([run, state], default=entry).encode()
+    # A prefix keeps the state apart from the entry of the run.
+    entries: dict[str, NDArray[Any]] = {}
+    for name, value in prefixed(STATE, state).items():
+        # A text or an object would need pickle, which runs what it reads.
+        array = np.asarray(value)
+        if array.dtype.hasobject or array.dtype.kind in "US":
+            raise CheckpointError(f"a state_dict holds arrays and numbers; {name} is {value!r}")
+        entries[name] = array
+    document = json.dumps(run).encode()
+    entries[RUN] = np.frombuffer(document, np.uint8)
+    # Whole or absent: the file is renamed once it is complete.
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, run=np.frombuffer(document, np.uint8), **arrays)
+    np.savez(stream, allow_pickle=False, **entries)
     return write_atomically(path, stream.getvalue())
 
 
 def load(path: Path, run: Mapping[str, Any]) -> State:
     """Read the state of a run.
 
-    Raises CheckpointError where the file is missing, damaged or of another run.
+    Args:
+        path: the checkpoint's file.
+        run: what identifies the run that is to go on.
+
+    Returns:
+        What `save` was given, numbers as Python's.
+
+    Raises:
+        CheckpointError: the file is missing, damaged or of another run.
     """
     try:
         entries = read_arrays(path)
-
-        def array(table: dict[str, Any]) -> Any:
-            return entries[table[ENTRY]] if table.keys() == {ENTRY} else table
-
-        found, state = json.loads(entries["run"].tobytes(), object_hook=array)
-        there, state = _flat(dict(found)), dict(state)
+        stored = _flat(dict(json.loads(entries[RUN].tobytes())))
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: there is no checkpoint to resume from; run without --resume"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
-    # Compare both as JSON, where tuples are lists.
-    here = _flat(json.loads(json.dumps(run)))
-    for key in sorted(there.keys() | here.keys()):
-        if there.get(key) != here.get(key):
-            raise CheckpointError(
-                f"{path}: the checkpoint is of another run: {key} is {there.get(key)!r} there and "
-                f"{here.get(key)!r} here; use another --out or the same settings"
-            )
+    _refuse_another_run(path, stored, run)
+    # NumPy reads a number as an array without dimensions.
+    state: State = {}
+    for name, array in part_of(entries, STATE).items():
+        state[name] = array.item() if array.ndim == 0 else array
     return state
 
 
+def prefixed(prefix: str, state: Mapping[str, Any]) -> State:
+    """The state of a part under the part's name.
+
+    Args:
+        prefix: the part's name.
+        state: its arrays and numbers by name.
+
+    Returns:
+        The same values, each by `prefix.name`.
+    """
+    return {f"{prefix}.{name}": value for name, value in state.items()}
+
+
+def part_of(state: Mapping[str, Any], prefix: str) -> State:
+    """The state of a part out of that of the whole; the inverse of `prefixed`.
+
+    Args:
+        state: arrays and numbers by name.
+        prefix: the part's name.
+
+    Returns:
+        The values whose names begin with `prefix.`, by the rest of their names.
+    """
+    start = f"{prefix}."
+    part: State = {}
+    for name, value in state.items():
+        if name.startswith(start):
+            part[name.removeprefix(start)] = value
+    return part
+
+
+def generator_state(rng: np.random.Generator) -> NDArray[np.uint64]:
+    """State of a PCG64 generator as six words: two numbers of 128 bits, and a 32-bit draw left."""
+    state: Any = rng.bit_generator.state
+    # NumPy has no integers of 128 bits.
+    words = []
+    for number in (state["state"]["state"], state["state"]["inc"]):
+        words += [number >> 64, number % 2**64]
+    words += [state["has_uint32"], state["uinteger"]]
+    return np.array(words, np.uint64)
+
+
+def set_generator_state(rng: np.random.Generator, words: NDArray[np.uint64]) -> None:
+    """Put a PCG64 generator back.
+
+    Args:
+        rng: the generator.
+        words: what `generator_state` returned, (6,).
+    """
+    high, low, increment_high, increment_low, has_uint32, uinteger = words.tolist()
+    rng.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {
+            "state": high << 64 | low,
+            "inc": increment_high << 64 | increment_low,
+        },
+        "has_uint32": has_uint32,
+        "uinteger": uinteger,
+    }
+
+
+def _refuse_another_run(
+    path: Path,
+    stored: Mapping[str, Any],
+    run: Mapping[str, Any],
+) -> None:
+    """Raise CheckpointError by the first field that differs; `stored` is flat already."""
+    # Compare both as JSON, where tuples are lists.
+    wanted = _flat(json.loads(json.dumps(run)))
+    for key in sorted(stored.keys() | wanted.keys()):
+        if stored.get(key) != wanted.get(key):
+            raise CheckpointError(
+                f"{path}: the checkpoint is of another run: {key} is {stored.get(key)!r} there and "
+                f"{wanted.get(key)!r} here; use another --out or the same settings"
+            )
+
+
 def _flat(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Each value by its name, those of an inner table as `table of name`."""
-    tables = {key: value for key, value in run.items() if isinstance(value, dict)}
-    inner = {f"{key} of {name}": v for key, table in tables.items() for name, v in table.items()}
-    return {key: value for key, value in run.items() if key not in tables} | inner
-
-
-def arrays_of(part: Any) -> State:
-    """The state of an object: what its class names in `KEPT`.
-
-    They may be objects of this kind, or with a method `state`. A list becomes an array: JSON is
-    slow.
-    """
-    return {name: _state(getattr(part, name)) for name in part.KEPT}
-
-
-def take_up(part: Any, state: State) -> None:
-    """Restore an object's state from `arrays_of`, in the order of `KEPT`.
-
-    A part with a method `restore` uses it. Raises KeyError where one is missing.
-    """
-    for name in part.KEPT:
-        present, value = getattr(part, name), state[name]
-        if hasattr(present, "restore"):
-            present.restore(value)
-        elif hasattr(present, "KEPT"):
-            take_up(present, value)
+    """Each value by its name, those of an inner table as `name of table`."""
+    flat: dict[str, Any] = {}
+    for key, value in run.items():
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                flat[f"{name} of {key}"] = inner
         else:
-            setattr(part, name, list(value) if isinstance(present, list) else deepcopy(value))
-
-
-def _state(value: Any) -> Any:
-    if callable(getattr(value, "state", None)):
-        return value.state()
-    if isinstance(value, list):
-        return np.array(value)
-    return arrays_of(value) if hasattr(value, "KEPT") else deepcopy(value)
+            flat[key] = value
+    return flat

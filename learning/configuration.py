@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -30,6 +30,15 @@ ExplorationShare = Annotated[
 ]
 
 
+class Hyperparameter(NamedTuple):
+    """What `--explain` says of a hyperparameter, in words."""
+
+    name: str
+    default: str
+    allowed: str
+    meaning: str
+
+
 class Configuration(BaseModel):
     """Hyperparameters that every algorithm has; an algorithm adds its own in a subclass.
 
@@ -50,7 +59,8 @@ class Configuration(BaseModel):
     )
     model_parameters: ModelParameters = ()
     smallest_eigenvalue: Positive = Field(
-        1e-3, description="least eigenvalue that B_l and B_Vf may have, in the problem's own units"
+        1e-3,
+        description="least eigenvalue that B_l and B_Vf may have, in the problem's own units",
     )
     exploration: Literal["additive", "literal", "none"] = Field(
         "additive",
@@ -60,7 +70,8 @@ class Configuration(BaseModel):
     exploration_probability: ExplorationProbability = 1.0
     exploration_share: ExplorationShare = 1 / 60
     exploration_deviation: tuple[NonNegative, ...] | None = Field(
-        None, description="in place of the share: σ of e in the units of u, one or one per action"
+        None,
+        description="in place of the share: σ of e in the units of u, one or one per action",
     )
 
     @classmethod
@@ -69,6 +80,7 @@ class Configuration(BaseModel):
 
         Raises ConfigurationError that names the field and what it may be.
         """
+        # A bare word is a text, so that no shell needs two kinds of quotes.
         values: dict[str, Any] = {}
         for assignment in assignments:
             name, equals, text = assignment.partition("=")
@@ -84,17 +96,18 @@ class Configuration(BaseModel):
 
     def for_scenario(self, scenario: Scenario) -> Self:
         """Copy with the scenario's values in place of defaults."""
+        # What a user has set stands, whatever the scenario says.
         stated: dict[str, Any] = {}
-        if (table := scenario.exploration) is not None:
-            stated = {
-                "exploration": table.kind,
-                "exploration_probability": table.probability,
-                "exploration_deviation": table.standard_deviation or (0.0,),
-            }
+        table = scenario.exploration
+        if table is not None:
+            stated["exploration"] = table.kind
+            stated["exploration_probability"] = table.probability
+            stated["exploration_deviation"] = table.standard_deviation or (0.0,)
         if scenario.controller.value_offset is not None:
             stated["value_offset"] = scenario.controller.value_offset
-        chosen = self.model_fields_set
-        return self.model_copy(update={k: v for k, v in stated.items() if k not in chosen})
+        for name in self.model_fields_set:
+            stated.pop(name, None)
+        return self.model_copy(update=stated)
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """Names of the model parameters that θ has."""
@@ -108,18 +121,49 @@ class Configuration(BaseModel):
 
     @model_validator(mode="after")
     def _refuse_what_has_no_part(self) -> Self:
+        # A setting that acts nowhere is a mistake of its user, who expects it to act.
         for name, where in self.without_part().items():
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{name}: has no part in {where}; leave it out")
         return self
 
     @classmethod
-    def documentation(cls) -> list[tuple[str, str, str]]:
-        """Name, default and meaning of each hyperparameter."""
-        return [
-            (name, repr(field.default), field.description or "")
-            for name, field in cls.model_fields.items()
-        ]
+    def documentation(cls) -> list[Hyperparameter]:
+        """Name, default, allowed values and meaning of each hyperparameter."""
+        # The schema knows ranges and choices, in words that pydantic has checked.
+        properties = cls.model_json_schema()["properties"]
+        documented = []
+        for name, field in cls.model_fields.items():
+            allowed = _allowed(properties[name])
+            meaning = field.description or ""
+            documented.append(Hyperparameter(name, repr(field.default), allowed, meaning))
+        return documented
+
+
+class GreedyConfiguration(Configuration):
+    """Hyperparameters of a rule with greedy samples and without a fit of θ."""
+
+    exploration: Literal["none"] = Field(
+        "none",
+        description="none: it is θ that is tried, not actions",
+    )
+
+    def for_scenario(self, scenario: Scenario) -> Self:
+        """Copy with what the scenario states of c_lambda's start; its exploration has no part."""
+        # A table [exploration] of the scenario is for the rules that explore.
+        unchanged = {}
+        for name in type(self).model_fields:
+            if name.startswith("exploration"):
+                unchanged[name] = getattr(self, name)
+        return super().for_scenario(scenario).model_copy(update=unchanged)
+
+    def without_part(self) -> Mapping[str, str]:
+        """Hyperparameters of exploration and steps."""
+        names = ["smallest_eigenvalue"]
+        for name in type(self).model_fields:
+            if name.startswith("exploration_"):
+                names.append(name)
+        return dict.fromkeys(names, "a rule that tries θ, not actions")
 
 
 def _value(text: str) -> Any:
@@ -127,3 +171,26 @@ def _value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         return text
+
+
+def _allowed(schema: Mapping[str, Any]) -> str:
+    """What a JSON schema allows, in words: a range, a choice, or a type."""
+    if "anyOf" in schema:
+        return " or ".join(_allowed(part) for part in schema["anyOf"])
+    if "enum" in schema:
+        return ", ".join(schema["enum"])
+    if "const" in schema:
+        return str(schema["const"])
+    if "prefixItems" in schema:
+        # Of a tuple of fixed length all entries are of one kind.
+        return f"{len(schema['prefixItems'])} × {_allowed(schema['prefixItems'][0])}"
+    if "items" in schema:
+        return f"list of {_allowed(schema['items'])}"
+    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    limits = []
+    for key, sign in signs.items():
+        if key in schema:
+            limits.append(f"{sign} {schema[key]:g}")
+    kind = str(schema.get("type", ""))
+    words = {"boolean": "true, false", "null": "nothing", "string": "text"}
+    return " ".join([words.get(kind, kind), ", ".join(limits)]).strip()

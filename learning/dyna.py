@@ -10,19 +10,21 @@ from pydantic import Field
 from controllers.problem import Problem
 from cosim.protocols import Array, Step
 from cosim.scenario import Scenario
-from learning.algorithm import PlantInOperation, TrainingLoop, Transition, Update
+from learning.algorithm import Transition, Update
+from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Count
-from learning.empirical_model import GROWTH, WINDOWS, EmpiricalModel, Features, PlantData
+from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
+from learning.loop import PlantInOperation, TrainingLoop
+from learning.plant_data import PlantData
 from learning.q_learning import QLearning, QLearningConfiguration
-from learning.step import moved
+from learning.step import update_without_fit
 
 
-class DynaConfiguration(QLearningConfiguration):
-    """Hyperparameters of `dyna`."""
+class DynaConfiguration(QLearningConfiguration, EmpiricalModelConfiguration):
+    """Hyperparameters of `dyna`: those of Q-learning and of the empirical model, and its own."""
 
     model_samples: int = Field(4, ge=0, description="samples of the model for each of the plant")
     interval: Count = Field(120, description="least samples of the plant between the model's fits")
-    memory: Count = Field(20_000, description="samples that the model remembers")
     exploration_samples: Count = Field(
         480,
         description="samples of the plant that explore after the start and after a change of it; "
@@ -33,7 +35,7 @@ class DynaConfiguration(QLearningConfiguration):
 class Dyna(QLearning):
     """Q-learning that learns from the plant and, from time to time, from its empirical model too.
 
-    The model is fitted to the present plant's data, whenever they have grown by an eighth and by
+    The model is fitted to the present regime's data, whenever they have grown by an eighth and by
     `interval` samples. From the plant's state the controller runs `model_samples` times as long on
     it, explores, and the same rule learns from that. Where the errors since the last fit have a
     mean that the model makes improbable, the plant has changed: its data begin anew, and so do the
@@ -42,72 +44,120 @@ class Dyna(QLearning):
     """
 
     Configuration: ClassVar[type[QLearningConfiguration]] = DynaConfiguration
-    KEPT = (*QLearning.KEPT, "_data", "model_samples")
     configuration: DynaConfiguration
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        features = Features(Problem.from_scenario(self.scenario))
-        self._data = PlantData(features, self.configuration.memory)
-        self._imagines = False
+        problem = Problem.from_scenario(self.scenario)
+        features = Features(problem, self.configuration.smallest_error_size)
+        self._data = PlantData(features, self.configuration)
+        self._imagines = False  # whether the samples are the model's now
         self.model_samples = 0
         """Samples of the model so far."""
 
     @property
     def explores(self) -> bool:
         """Whether the samples explore now."""
-        age = self._data.count - self._data.era
-        return self._imagines or age < self.configuration.exploration_samples
+        return self._imagines or self._data.age < self.configuration.exploration_samples
 
     def observe(self, transition: Transition) -> Update | None:
         """Learn from one sample of the plant and, when due, from the model's."""
-        update, data = super().observe(transition), self._data
+        # The plant's own sample teaches first.
+        update = super().observe(transition)
+        settings = self.configuration
+        data = self._data
         data.add(transition)
-        since = data.count - data.fitted
-        judged = data.model is not None and since % WINDOWS[0] == 0
-        changed = judged and data.changed(*data.errors()[2:])
-        age = data.count - data.era
+        since_fit = data.since_fit
+        changed = False
+        if data.model is not None and since_fit % settings.change_windows[0] == 0:
+            changed = data.changed(data.predictions())
         if changed:
-            self._count, self._first = 0, []
-            self._average_cost.mean_cost = self.scenario.controller.reference_cost
-        if since < max(self.configuration.interval, age // GROWTH) and not changed:
+            # Noise and widths were those of another plant.
+            self.begin_anew()
+        age = data.age
+        due = since_fit >= max(settings.interval, age // settings.refit_growth)
+        if not due and not changed:
             return update
-        return self._imagine(data.fit(), transition.next_s, min(since, age))
+        model = data.fit()
+        return self._imagine(model, transition.next_s, min(since_fit, age))
 
-    def _imagine(self, model: EmpiricalModel, s: Array, since: int) -> Update:
-        """Learn from a trajectory of the model from the state s, after so many of the plant."""
-        controller, before = self.controller, self.controller.theta
+    def _imagine(
+        self,
+        model: EmpiricalModel,
+        s: Array,
+        n_plant_samples: int,
+    ) -> Update:
+        """Learn from a trajectory of the model.
+
+        Args:
+            model: of the present regime.
+            s: where it begins, (n,).
+            n_plant_samples: since the last one.
+        """
+        controller = self.controller
+        before = controller.theta
         plant = ModelPlant(self.scenario, model, s, self.rng)
         loop = TrainingLoop(plant, controller, self, self.strategy, self.rng)
+        # From where the plant is: the model knows nothing of other places.
         loop.start(s)
         self._imagines = True
-        for _ in range(self.configuration.model_samples * since):
+        for _ in range(self.configuration.model_samples * n_plant_samples):
             transition, _ = loop.next()
             if transition is not None and super().observe(transition):
                 loop.renew()
         self._imagines = False
         self.model_samples += loop.counts.number
-        return moved(controller.parameters.blocks, before, controller.theta)
+        return update_without_fit(controller.parameters.blocks, before, controller.theta)
+
+    def state_dict(self) -> State:
+        """What Q-learning keeps, the data and the model."""
+        return {
+            **super().state_dict(),
+            **prefixed("data", self._data.state_dict()),
+            "model_samples": self.model_samples,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        super().load_state_dict(state)
+        self._data.load_state_dict(part_of(state, "data"))
+        self.model_samples = state["model_samples"]
 
 
 class ModelPlant(PlantInOperation):
-    """A plant simulated by an empirical model from s (n,), with resampled residuals."""
+    """A plant simulated by an empirical model, with residuals drawn anew.
+
+    Args:
+        scenario: bounds and penalty.
+        model: plays the plant.
+        s: state at the start, (n,).
+        rng: draws the residuals.
+    """
 
     __slots__ = ()
 
     def __init__(
-        self, scenario: Scenario, model: EmpiricalModel, s: Array, rng: np.random.Generator
+        self,
+        scenario: Scenario,
+        model: EmpiricalModel,
+        s: Array,
+        rng: np.random.Generator,
     ) -> None:
         self.scenario = scenario
-        (c, W), present = model.coefficients, s
+        c, W = model.coefficients
+        present = s
 
         def step(a: Array) -> Step:
             nonlocal present
-            inputs, penalty = np.concatenate([present, a]), scenario.state_penalty(present.tolist())
+            penalty = scenario.state_penalty(present.tolist())
+            # Residuals as they came, so that no law of the noise is assumed.
+            inputs = np.concatenate([present, a])
             y, _, h = model.features(inputs[None], c)
-            residual = model.residuals[rng.integers(len(model.residuals))]
-            outcome = y[0] + W @ np.append(1.0, inputs) + h[0] * residual
+            pick = rng.integers(len(model.residuals))
+            linear = W @ np.append(1.0, inputs)
+            outcome = y[0] + linear + h[0] * model.residuals[pick]
             present = outcome[:-1]
-            return Step(present, float(outcome[-1]), penalty, np.zeros(0))
+            stage_cost = float(outcome[-1])
+            return Step(present, stage_cost, penalty, np.zeros(0))
 
         self.step = step

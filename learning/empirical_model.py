@@ -12,97 +12,151 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
-from typing import Any, ClassVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
+from pydantic import Field
 
-from controllers.export.core import core
 from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
-from controllers.rti import RtiNmpc
-from controllers.theta import Parameters
 from cosim.protocols import Array
-from cosim.simulation import recover
-from learning.algorithm import Transition
-from learning.checkpoint import State, take_up
+from learning.checkpoint import State
+from learning.configuration import Configuration, Count, NonNegative, Positive, Share
 
-PARAMETER_DEVIATION = 0.15
-"""Prior standard deviation of a parameter's error, as a share of its value."""
-MOST = 0.5
-"""Largest such error."""
-SLOPE_DEVIATIONS = (0.1, 0.01, 0.001)
-"""Those of W's slopes to choose from, in standard deviations of the error over one of the input."""
-FLOOR = 0.1
-"""Least h, as a share of its value at the reference."""
-EXACT = 1e-6
+INTEGRATION_ERROR = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
-ROUNDS, ENOUGH = 6, 2000
-"""Fits, each about the parameters and with the residuals' covariance of the one before, and samples
-of which all but the last take no more than twice as many."""
-ALARM, SUSPICION = 1e-7, 1e-4
-"""Probability below which the mean error since the last fit speaks of another plant, alone and
-where the samples are dearer than was promised too."""
-WINDOWS = (15, 60, 240, 960)
-"""Latest samples of which that mean is taken, every `WINDOWS[0]` samples."""
-FORETOLD, EVIDENCE = 240, 3.0
-"""Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
 BLOCK = 250
-"""Rows of the fit that are factored at a time."""
-GROWTH = 8
-"""A model of many samples is fitted anew where its data have grown by one in so many."""
-POOL = 480
-"""Number of residuals up to which those from before a change are kept."""
+"""Rows of the fit that are factored at a time: as many as fit in a processor's cache."""
+
+
+class EmpiricalModelConfiguration(Configuration):
+    """Hyperparameters of the empirical model and of its data, for the rules that use one."""
+
+    memory: Count = Field(20_000, description="samples that the model remembers")
+    parameter_deviation: Positive = Field(
+        0.15,
+        description="prior standard deviation of a parameter's error, as a share of its value",
+    )
+    largest_parameter_error: Positive = Field(
+        0.5,
+        description="largest error of a parameter, as a share of its value",
+    )
+    slope_deviations: tuple[Positive, ...] = Field(
+        (0.1, 0.01, 0.001),
+        description="prior standard deviations of W's slopes to choose from by evidence, in "
+        "standard deviations of the error over one of the input",
+    )
+    smallest_error_size: Positive = Field(
+        0.1,
+        description="least h, as a share of its value at the reference",
+    )
+    fit_rounds: Count = Field(
+        6,
+        description="fits, each about the parameters and with the residuals' covariance of the one "
+        "before",
+    )
+    fit_samples: Count = Field(
+        2000,
+        description="samples of which all fits but the last take no more than twice as many",
+    )
+    refit_growth: Count = Field(
+        8,
+        description="a model is fitted anew where its data have grown by one in so many",
+    )
+    change_windows: tuple[Count, Count, Count, Count] = Field(
+        (15, 60, 240, 960),
+        description="latest samples over whose means a change of the plant is looked for, every "
+        "time that the first number of samples has come",
+    )
+    change_probability: Share = Field(
+        1e-7,
+        description="probability of a window's mean error below which the plant is another one",
+    )
+    suspicion_probability: Share = Field(
+        1e-4,
+        description="the same where the window costs more than was predicted, too",
+    )
+    forecast_samples: Count = Field(
+        240,
+        description="least number of latest samples whose prediction decides about older data",
+    )
+    forecast_evidence: NonNegative = Field(
+        3.0,
+        description="nats by which older data must spoil that prediction to be dropped",
+    )
+    earlier_residuals: Count = Field(
+        480,
+        description="number of residuals up to which those from before a change are kept",
+    )
 
 
 class Features:
     """The nominal model as a function of its parameters' errors c (p,), for K = n + 1 outputs.
 
-    `mean` is y (K,) and h (K,) of (s, a, c), a CasADi function; h is that of c = 0. The cost is the
-    last output.
+    The cost is the last output. Parameters are the model's and then its nominal disturbances.
+
+    Args:
+        problem: has the nominal model.
+        smallest_error_size: least h, as a share of its value at the reference.
+
+    Attributes:
+        mean: CasADi function of (s, a, c): y (K,) and h (K,); h is that of c = 0.
+        n_inputs: n + m.
+        n_outputs: K.
+        n_parameters: p.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, smallest_error_size: float = 0.1) -> None:
         model = problem.model
         x, u, d, p = model.symbols()
         step = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
         outputs = ca.vertcat(step, economic_cost(model)(x, u, d, p))
+        # Parameters and nominal disturbances alike are c times their value larger.
         nominal = ca.DM([*model.nominal_parameters, *model.nominal_disturbance])
         c = ca.SX.sym("c", nominal.numel())
         (y,) = ca.substitute([outputs], [ca.vertcat(p, d)], [nominal * (1 + c)])
         G = ca.jacobian(y, c)
+
+        # The size of the error that disturbances in proportion to their values would make.
         by_disturbance = ca.substitute(G[:, p.numel() :], c, ca.DM.zeros(c.shape))
         size = ca.sqrt(ca.sum2(by_disturbance**2))
-        at = ca.Function("size", [x, u], [size])
-        reference = at(problem.reference_state, problem.reference_action).full()[:, 0]
-        sizes = zip(ca.vertsplit(size), reference, strict=True)
-        h = ca.vertcat(*(ca.fmax(own, FLOOR * at) if at > 0 else 1.0 for own, at in sizes))
-        given, names = [x, u, c], ["x", "u", "c"]
-        y, G, h = (ca.densify(part) for part in (y, G, h))
-        self.mean = ca.Function("nominal", given, [y, h], names, ["y", "h"])
-        self._function = ca.Function("features", given, [y, G.T, h], names, ["y", "G", "h"])
-        self.outputs, self.count = G.shape
-        self.inputs = problem.n_states + problem.n_actions
+        size_at = ca.Function("size", [x, u], [size])
+        # An output that no disturbance moves has no size; it is in its own unit.
+        at_reference = size_at(problem.reference_state, problem.reference_action).full()[:, 0]
+        floored = []
+        for entry, reference in zip(ca.vertsplit(size), at_reference, strict=True):
+            least = smallest_error_size * reference
+            floored.append(ca.fmax(entry, least) if reference > 0 else 1.0)
+        h = ca.densify(ca.vertcat(*floored))
+        y = ca.densify(y)
+        G = ca.densify(G)
+
+        # One function for the loop (y, h), one for the fit, which needs G too.
+        arguments = [x, u, c]
+        names = ["x", "u", "c"]
+        self.mean = ca.Function("nominal", arguments, [y, h], names, ["y", "h"])
+        self._function = ca.Function("features", arguments, [y, G.T, h], names, ["y", "G", "h"])
+        self.n_outputs, self.n_parameters = G.shape
+        self.n_inputs = problem.n_states + problem.n_actions
         self.compiled = None
         if not_in_c([self._function]) is not None:
             return
-        constants = {
+        sizes = {
             "N_X": problem.n_states,
-            "N_IN": self.inputs,
-            "K": self.outputs,
-            "P": self.count,
+            "N_IN": self.n_inputs,
+            "K": self.n_outputs,
+            "P": self.n_parameters,
             **work_sizes("FEATURES", self._function),
         }
         path = library(
             {
-                "sizes.h": _definitions(constants),
+                "sizes.h": c_definitions(sizes),
                 "nominal.h": "#define CASADI_SYMBOL_EXPORT static\n" + c_source([self._function]),
                 "features.c": (files("learning") / "features.c").read_bytes(),
             }
@@ -111,28 +165,43 @@ class Features:
             self.compiled = ctypes.CDLL(str(path)).features_at
 
     def __call__(self, inputs: Array, c: Array) -> tuple[Array, Array, Array]:
-        """y (M, K), its derivative by c, G (M, K, p), and h (M, K) at inputs (s, a), (M, n+m)."""
-        M, n, K = len(inputs), self.outputs - 1, self.outputs
+        """The nominal model at many inputs.
+
+        Args:
+            inputs: (s, a), (M, n+m).
+            c: errors of the parameters, (p,).
+
+        Returns:
+            y (M, K), its derivative by c, G (M, K, p), and h (M, K).
+        """
+        M = len(inputs)
+        K = self.n_outputs
+        n = K - 1
         if self.compiled is not None:
-            y, G, h = np.empty((M, K)), np.empty((M, K, self.count)), np.empty((M, K))
+            y = np.empty((M, K))
+            G = np.empty((M, K, self.n_parameters))
+            h = np.empty((M, K))
             rows = np.ascontiguousarray(inputs)
-            self.compiled(*_pointers(rows, c), ctypes.c_longlong(M), *_pointers(y, G, h))
+            self.compiled(*pointers(rows, c), ctypes.c_longlong(M), *pointers(y, G, h))
             return y, G, h
         results = self._function(inputs[:, :n].T, inputs[:, n:].T, c)
-        y, G, h = (part.full() for part in results)
-        return y.T, G.T.reshape(M, K, self.count), h.T
+        y, G_transposed, h = (result.full() for result in results)
+        G = G_transposed.T.reshape(M, K, self.n_parameters)
+        return y.T, G, h.T
 
 
 @dataclass(frozen=True)
 class EmpiricalModel:
     """The estimate from M transitions.
 
-    `mean` (p + K(1+n+m),) has c, then W row by row for the inputs (1, s, a), standardised by
-    `centre` and `unit` (n+m,); `covariance` is its posterior's;
-    `residuals` (M, K) are r, mean zero.
+    Attributes:
+        features: the nominal model.
+        centre, unit: by which inputs are standardised, (n+m,).
+        mean: c, then W row by row for the inputs (1, s, a), standardised, (p + K(1+n+m),).
+        covariance: that of the posterior of `mean`.
+        residuals: r, (M, K), of mean zero.
     """
 
-    KEPT: ClassVar = ("centre", "unit", "mean", "covariance", "residuals")
     features: Features
     centre: Array
     unit: Array
@@ -142,59 +211,103 @@ class EmpiricalModel:
 
     @classmethod
     def fit(
-        cls, features: Features, inputs: Array, outputs: Array, pool: Array | None = None
+        cls,
+        features: Features,
+        inputs: Array,
+        outputs: Array,
+        settings: EmpiricalModelConfiguration,
+        earlier_residuals: Array | None = None,
     ) -> EmpiricalModel:
-        """Estimate from inputs (s, a), (M, n+m), and outputs (s₊, ℓ), (M, K).
+        """Estimate from transitions.
 
-        `pool` has residuals (·, K) of an earlier estimate, which are kept beside the new ones.
+        Args:
+            features: the nominal model.
+            inputs: (s, a), (M, n+m).
+            outputs: (s₊, ℓ), (M, K).
+            settings: prior and rounds.
+            earlier_residuals: of an earlier estimate, (·, K); they are kept beside the new ones.
         """
-        centre, unit = inputs.mean(axis=0), inputs.std(axis=0)
+        p = features.n_parameters
+        if earlier_residuals is None:
+            earlier_residuals = np.empty((0, features.n_outputs))
+        # Standardised inputs: one width of the prior serves all slopes.
+        centre = inputs.mean(axis=0)
+        unit = inputs.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
-        thinned, p = max(len(inputs) // ENOUGH, 1), features.count
-        y, _, h = features(inputs[::thinned], c := np.zeros(p))
-        deviation = (outputs[::thinned] - y).std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
-        parameters = np.full(p, PARAMETER_DEVIATION)
-        priors = [
-            np.append(parameters, np.outer(deviation, [1.0] + [slopes] * features.inputs))
-            for slopes in SLOPE_DEVIATIONS
-        ]
-        older = np.empty((0, features.outputs)) if pool is None else pool
-        residuals = (outputs[::thinned] - y) / h
+
+        # All fits but the last take every `thinning`-th sample.
+        thinning = max(len(inputs) // settings.fit_samples, 1)
+        c = np.zeros(p)
+        y, _, h = features(inputs[::thinning], c)
+        nominal_errors = outputs[::thinning] - y
+        # The sizes of the nominal model's errors set the widths of W.
+        priors = _priors(nominal_errors, y, features, settings)
+        residuals = nominal_errors / h
         residuals = residuals - residuals.mean(axis=0)
-        least = EXACT**2 * ((y / h) ** 2).mean(axis=0)
-        for step in (*[thinned] * (ROUNDS - 1), 1):
-            some, given = inputs[::step], outputs[::step]
-            y, G, h = features(some, c)
-            known = np.concatenate([residuals, older])
+        least_variance = INTEGRATION_ERROR**2 * ((y / h) ** 2).mean(axis=0)
+
+        for step in [thinning] * (settings.fit_rounds - 1) + [1]:
+            some_inputs = inputs[::step]
+            some_outputs = outputs[::step]
+            # Residuals from before a change help to size the noise of a young regime.
+            known = np.concatenate([residuals, earlier_residuals])
             noise = known.T @ known / len(known)
             variance = np.diag(noise)
-            noise = noise + np.diag(np.maximum(least - variance, 1e-9 * variance))
-            design = _design(G, (some - centre) / unit) / h[:, :, None]
-            mean, covariance = _posterior(design, (given - y + G @ c) / h, noise, priors)
-            c = mean[:p] = mean[:p].clip(-MOST, MOST)
-            y, _, _ = features(some, c)
-            residuals = (given - y) / h - design[:, :, p:] @ mean[p:]
-        residuals = np.concatenate([residuals - residuals.mean(axis=0), older])
+            missing = np.maximum(least_variance - variance, 1e-9 * variance)
+            noise = noise + np.diag(missing)
+            y, G, h = features(some_inputs, c)
+            standardised = (some_inputs - centre) / unit
+            design = design_rows(G, standardised) / h[:, :, None]
+            # Linearised at the present c: a Gauss-Newton step.
+            target = (some_outputs - y + G @ c) / h
+            mean, covariance = _posterior(design, target, noise, priors)
+            largest = settings.largest_parameter_error
+            c = mean[:p].clip(-largest, largest)
+            # Beyond its largest error a parameter means another plant, not a fit.
+            mean[:p] = c
+            y, _, _ = features(some_inputs, c)
+            linear_part = design[:, :, p:] @ mean[p:]
+            residuals = (some_outputs - y) / h - linear_part
+
+        residuals = np.concatenate([residuals - residuals.mean(axis=0), earlier_residuals])
         return cls(features, centre, unit, mean, covariance, residuals)
 
     def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
-        """Predictions of (s₊, ℓ) without r, h (M, K), and their derivative by `mean` over h."""
-        p = self.features.count
-        y, G, h = self.features(inputs, self.mean[:p])
-        design = _design(G, (inputs - self.centre) / self.unit) / h[:, :, None]
-        return y + h * (design[:, :, p:] @ self.mean[p:]), h, design
+        """Predictions at inputs (s, a), (M, n+m).
 
-    def lack(self, inputs: Array, c: Array) -> Array:
-        """What predictions of s₊ by y(s, a; c) lack on average at inputs (M, n+m), (n,)."""
+        Returns:
+            (s₊, ℓ) without r and h, (M, K) each, and the predictions' derivative by `mean` over h,
+            (M, K, p + K(1+n+m)).
+        """
+        p = self.features.n_parameters
+        y, G, h = self.features(inputs, self.mean[:p])
+        standardised = (inputs - self.centre) / self.unit
+        design = design_rows(G, standardised) / h[:, :, None]
+        linear_part = design[:, :, p:] @ self.mean[p:]
+        return y + h * linear_part, h, design
+
+    def nominal_prediction_error(self, inputs: Array, c: Array) -> Array:
+        """Mean one-step prediction error of the nominal model, as this model knows it.
+
+        Args:
+            inputs: (s, a), (M, n+m).
+            c: errors of the nominal model's parameters, (p,).
+
+        Returns:
+            Mean of s₊ − y(s, a; c), (n,).
+        """
         y, _, _ = self.features(inputs, c)
-        mean: Array = (self.predict(inputs)[0] - y)[:, :-1].mean(axis=0)
+        # The model's own prediction stands for the plant's mean.
+        predicted, _, _ = self.predict(inputs)
+        mean: Array = (predicted - y)[:, :-1].mean(axis=0)
         return mean
 
-    def cost_row(self, inputs: Array) -> Array:
-        """Derivative of the mean cost at inputs (M, n+m) by `mean`."""
-        _, G, _ = self.features(inputs, self.mean[: self.features.count])
-        row: Array = _design(G, (inputs - self.centre) / self.unit)[:, -1].mean(axis=0)
-        return row
+    def cost_derivative(self, inputs: Array) -> Array:
+        """Derivative of the mean cost at inputs (M, n+m) by `mean`, (p + K(1+n+m),)."""
+        _, G, _ = self.features(inputs, self.mean[: self.features.n_parameters])
+        standardised = (inputs - self.centre) / self.unit
+        derivative: Array = design_rows(G, standardised)[:, -1].mean(axis=0)
+        return derivative
 
     @cached_property
     def noise(self) -> Array:
@@ -204,210 +317,69 @@ class EmpiricalModel:
     @property
     def coefficients(self) -> tuple[Array, Array]:
         """c (p,) and W (K, 1+n+m) for inputs in their own units."""
-        c, W = self.mean[: self.features.count], self.mean[self.features.count :]
-        W = W.reshape(self.features.outputs, -1)
+        p = self.features.n_parameters
+        W = self.mean[p:].reshape(self.features.n_outputs, -1)
         slopes = W[:, 1:] / self.unit
-        return c, np.column_stack([W[:, 0] - slopes @ self.centre, slopes])
+        constants = W[:, 0] - slopes @ self.centre
+        return self.mean[:p], np.column_stack([constants, slopes])
 
-
-class PlantData:
-    """The latest transitions of a plant in operation, and the `model` of the plant as it is now.
-
-    `count` samples so far, `era` of them before the present plant's, `fitted` at the last fit.
-    """
-
-    KEPT = ("_rows", "_pool", "count", "era", "fitted", "model")
-
-    def __init__(self, features: Features, memory: int) -> None:
-        self.features = features
-        self.model: EmpiricalModel | None = None
-        self.count, self.era, self.fitted = 0, 0, 0
-        # A ring of transitions (s, a, s₊, ℓ), and the residuals from before the last change.
-        self._rows = np.zeros((memory, features.inputs + features.outputs))
-        self._pool = np.zeros((0, features.outputs))
-        # Of each `WINDOWS[0]` samples since the fit what `errors` says of them.
-        self._judged: list[tuple[Array, Array, Array, Array]] = []
-
-    def add(self, transition: Transition) -> None:
-        """Keep a transition in place of the oldest one."""
-        row = (transition.s, transition.a, transition.next_s, [transition.stage_cost])
-        self._rows[self.count % len(self._rows)] = np.concatenate(row)
-        self.count += 1
-
-    def latest(self, count: int) -> tuple[Array, Array]:
-        """Inputs (s, a) and outputs (s₊, ℓ) of so many of the latest samples, oldest first."""
-        count = min(count, self.count, len(self._rows))
-        rows = self._rows[np.arange(self.count - count, self.count) % len(self._rows)]
-        return rows[:, : self.features.inputs], rows[:, self.features.inputs :]
-
-    @property
-    def present(self) -> tuple[Array, Array]:
-        """Inputs and outputs of the plant as it is now."""
-        return self.latest(self.count - self.era)
-
-    def fit(self) -> EmpiricalModel:
-        """Fit the model to the plant as it is now; data that spoil its predictions are dropped."""
-        inputs, outputs = self.present
-        if outdated := self._outdated(inputs, outputs):
-            self.era = self.count - len(inputs) + outdated
-            inputs, outputs = self.present
-        pool = self._pool[: max(POOL - len(inputs), 0)]
-        self.model = model = EmpiricalModel.fit(self.features, inputs, outputs, pool)
-        self.fitted, self._judged = self.count, []
-        return model
-
-    def _outdated(self, inputs: Array, outputs: Array) -> int:
-        """Number of oldest samples without which the model foretells the latest quarter better."""
-        latest = len(inputs) // 4
-        if latest < FORETOLD:
-            return 0
-        older, losses = (len(inputs) - latest) // 2, []
-        models = [
-            EmpiricalModel.fit(self.features, inputs[first:-latest], outputs[first:-latest])
-            for first in (0, older)
-        ]
-        precision = np.linalg.pinv(models[1].noise)
-        for model in models:
-            predicted, h, _ = model.predict(inputs[-latest:])
-            errors = (outputs[-latest:] - predicted) / h
-            losses.append(float(np.einsum("mi,ij,mj->", errors, precision, errors)) / 2)
-        return older if losses[0] - losses[1] > EVIDENCE else 0
-
-    def errors(self) -> tuple[Array, Array, Array, Array]:
-        """Predictions, h, errors over h and designs of the samples since the fit.
-
-        Of the latest `WINDOWS[-1]` of them at most; a last part below `WINDOWS[0]` is left out.
-        """
-        assert self.model is not None
-        block, judged = WINDOWS[0], self._judged
-        since = self.count - self.fitted
-        inputs, outputs = self.latest(since - block * len(judged))
-        for first in range(0, len(inputs) - block + 1, block):
-            at = slice(first, first + block)
-            predicted, h, designs = self.model.predict(inputs[at])
-            judged.append((predicted, h, (outputs[at] - predicted) / h, designs))
-        parts = zip(*judged[-WINDOWS[-1] // block :], strict=True)
-        predicted, h, errors, designs = (np.concatenate(part) for part in parts)
-        return predicted, h, errors, designs
-
-    def changed(self, errors: Array, designs: Array, suspect: Sequence[int] = ()) -> bool:
-        """Whether the mean of `errors` (T, K), with their designs, is improbable in a window.
-
-        The data of the present plant begin with that window then. In `suspect` ones less improbable
-        is enough.
-        """
-        model = self.model
-        assert model is not None
-        M, K = model.residuals.shape
-        for window in WINDOWS:
-            if window > len(errors):
-                break
-            mean, design = errors[-window:].mean(axis=0), designs[-window:].mean(axis=0)
-            covariance = model.noise / window + design @ model.covariance @ design.T
-            statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
-            alarm = SUSPICION if window in suspect else ALARM
-            if fdtrc(K, M - K, max(statistic, 0.0)) < alarm:
-                self.era, self._pool = self.count - window, model.residuals[-POOL:]
-                return True
-        return False
-
-    def restore(self, state: State) -> None:
-        """Take back what a checkpoint has of this."""
-        take_up(self, state)
-        if state["model"] is not None:
-            self.model = EmpiricalModel(self.features, **state["model"])
-
-
-class Rollout:
-    """The RTI-NMPC of a problem in closed loop with empirical models.
-
-    In C; without a compiler in Python, many times slower. θ and the model are arguments of each
-    call, so that one library serves a problem.
-    """
-
-    def __init__(self, problem: Problem, parameters: Parameters, features: Features) -> None:
-        self._problem, self._features = problem, features
-        self._controller = RtiNmpc(problem, parameters)
-        self.compiled = None
-        function = features.mean
-        if not_in_c([function]) is not None:
-            return
-        sizes = {"K": features.outputs, **work_sizes("NOMINAL", function)}
-        sources: dict[str, str | bytes] = {
-            **core(problem, parameters).sources,
-            "sizes.h": _definitions(sizes),
-            # Where a function says that it is exported, Windows exports no other.
-            "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
-            "rollout.c": (files("learning") / "rollout.c").read_bytes(),
+    def state_dict(self) -> State:
+        """All but the features."""
+        return {
+            "centre": self.centre,
+            "unit": self.unit,
+            "mean": self.mean,
+            "covariance": self.covariance,
+            "residuals": self.residuals,
         }
-        path = library(sources)
-        if path is not None:
-            self.compiled = ctypes.CDLL(str(path)).rollout
-
-    def __call__(
-        self, thetas: Sequence[Array], start: Array, model: EmpiricalModel, picks: NDArray[np.int32]
-    ) -> list[tuple[Array, Array, Array]]:
-        """For each θ inputs (s, a), predictions of (s₊, ℓ) without r, and h, (T, …) each.
-
-        θ (n_θ,); `start` (n,); `picks` (T,) says which of the model's residuals each sample meets.
-        Where the QP fails the last action is repeated. Fewer samples where a state is not finite.
-        The compiled rollouts of several θ run at once, in threads.
-        """
-        with ThreadPoolExecutor(1 if self.compiled is None else None) as pool:
-            return list(pool.map(lambda theta: self._one(theta, start, model, picks), thetas))
-
-    def _one(
-        self, theta: Array, start: Array, model: EmpiricalModel, picks: NDArray[np.int32]
-    ) -> tuple[Array, Array, Array]:
-        shape, steps = (len(picks), self._features.outputs), len(picks)
-        inputs = np.empty((steps, self._features.inputs))
-        predicted, h = np.empty(shape), np.empty(shape)
-        if self.compiled is not None:
-            given = (theta, start, *model.coefficients, model.residuals, picks)
-            arrays = [np.ascontiguousarray(array) for array in given]
-            steps = self.compiled(*_pointers(*arrays), steps, *_pointers(inputs, predicted, h))
-            return inputs[:steps], predicted[:steps], h[:steps]
-        problem, controller, s = self._problem, self._controller, start
-        (c, W), a = model.coefficients, problem.reference_action
-        controller.theta = theta
-        controller.reset()
-        with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
-            for step, pick in enumerate(picks):
-                if not np.isfinite(s).all():
-                    return inputs[:step], predicted[:step], h[:step]
-                try:
-                    controller.prepare()
-                    a = np.clip(
-                        controller.feedback(s).action, problem.action_lower, problem.action_upper
-                    )
-                except Exception as error:
-                    recover(controller, error)
-                inputs[step] = np.concatenate([s, a])
-                y, size = self._features.mean(s, a, c)
-                predicted[step] = y.full()[:, 0] + W @ np.append(1.0, inputs[step])
-                h[step] = size.full()[:, 0]
-                s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
-        return inputs, predicted, h
 
 
-def _pointers(*arrays: NDArray[Any]) -> list[ctypes.c_void_p]:
+def pointers(*arrays: NDArray[Any]) -> list[ctypes.c_void_p]:
+    """The addresses of arrays, as arguments of a C function."""
     return [ctypes.c_void_p(array.ctypes.data) for array in arrays]
 
 
-def _definitions(sizes: Mapping[str, int]) -> str:
+def c_definitions(sizes: Mapping[str, int]) -> str:
+    """A `#define` for each size."""
     return "".join(f"#define {name} {value}\n" for name, value in sizes.items())
 
 
-def _design(G: Array, standardised: Array) -> Array:
-    """Rows (M, K, p + K(1+n+m)) of the regression."""
+def design_rows(G: Array, standardised: Array) -> Array:
+    """Rows of the regression: the derivative of the outputs by (c, W).
+
+    Args:
+        G: derivative of y by c, (M, K, p).
+        standardised: inputs, (M, n+m).
+
+    Returns:
+        (M, K, p + K(1+n+m)).
+    """
     M, K, p = G.shape
     inputs = np.column_stack([np.ones(M), standardised])
     q = inputs.shape[1]
     design = np.zeros((M, K, p + K * q))
     design[:, :, :p] = G
     for i in range(K):
-        design[:, i, p + i * q : p + (i + 1) * q] = inputs
+        first = p + i * q
+        design[:, i, first : first + q] = inputs
     return design
+
+
+def _priors(
+    errors: Array,
+    y: Array,
+    features: Features,
+    settings: EmpiricalModelConfiguration,
+) -> list[Array]:
+    """Prior deviations of (c, W), one array for each width of W's slopes."""
+    # Of an output that the nominal model knows exactly, W stays near zero.
+    deviation = errors.std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
+    parameters = np.full(features.n_parameters, settings.parameter_deviation)
+    priors = []
+    for slope in settings.slope_deviations:
+        row = [1.0] + [slope] * features.n_inputs
+        priors.append(np.append(parameters, np.outer(deviation, row)))
+    return priors
 
 
 def _triangle(rows: Array) -> Array:
@@ -417,24 +389,45 @@ def _triangle(rows: Array) -> Array:
     fit in a processor's cache are factored first, which takes a third of the time.
     """
     whole = len(rows) // BLOCK * BLOCK
-    blocks = np.linalg.qr(rows[:whole].reshape(-1, BLOCK, rows.shape[1]), mode="r")
-    return np.asarray(np.linalg.qr(np.concatenate([*blocks, rows[whole:]]), mode="r"))
+    blocks = rows[:whole].reshape(-1, BLOCK, rows.shape[1])
+    triangles = np.linalg.qr(blocks, mode="r")
+    stacked = np.concatenate([*triangles, rows[whole:]])
+    return np.asarray(np.linalg.qr(stacked, mode="r"))
 
 
 def _posterior(
-    design: Array, target: Array, noise: Array, priors: Sequence[Array]
+    design: Array,
+    target: Array,
+    noise: Array,
+    priors: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """Mean and covariance of the coefficients, with the prior deviations of greatest evidence."""
+    """Mean and covariance of the coefficients, with the prior deviations of greatest evidence.
+
+    Args:
+        design: (M, K, q).
+        target: (M, K).
+        noise: covariance of the residuals, (K, K).
+        priors: deviations (q,) to choose from.
+    """
+    # Whitened outputs have independent errors of one size.
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
-    rows = (whiten @ design).reshape(-1, design.shape[2])
-    rows = np.column_stack([rows, (target @ whiten.T).reshape(-1)])
-    R = _triangle(rows)
-    found = []
+    white_design = (whiten @ design).reshape(-1, design.shape[2])
+    white_target = (target @ whiten.T).reshape(-1)
+    R = _triangle(np.column_stack([white_design, white_target]))
+    greatest = -np.inf
+    best: tuple[Array, Array] | None = None
     for prior in priors:
-        Q, root = np.linalg.qr(np.concatenate([R[:, :-1] * prior, np.eye(prior.size)]))
+        # The prior as further rows: a ridge regression by QR.
+        data_rows = R[:, :-1] * prior
+        prior_rows = np.eye(prior.size)
+        Q, root = np.linalg.qr(np.concatenate([data_rows, prior_rows]))
         moment = Q[: len(R)].T @ R[:, -1]
         factor = prior[:, None] * np.linalg.inv(root)
-        evidence = moment @ moment / 2 - np.log(np.abs(np.diag(root))).sum()
-        found.append((float(evidence), factor @ moment, factor @ factor.T))
-    _, mean, covariance = max(found, key=lambda item: item[0])
-    return mean, covariance
+        # Evidence: how well the data are explained, less what the fit could have explained.
+        log_determinant = np.log(np.abs(np.diag(root))).sum()
+        evidence = float(moment @ moment / 2 - log_determinant)
+        if best is None or evidence > greatest:
+            greatest = evidence
+            best = (factor @ moment, factor @ factor.T)
+    assert best is not None
+    return best

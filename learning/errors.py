@@ -24,4 +24,4 @@ class DivergenceError(LearningError):
 
 
 class PrivilegeError(LearningError):
-    """An algorithm for a plant in operation used a simulator's abilities."""
+    """An algorithm that requires a plant in operation used a simulator's abilities."""

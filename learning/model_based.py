@@ -1,11 +1,11 @@
 """`model-based`: θ searched on a model of the plant that its own operation has taught.
 
-The cost is tuned on the nominal model, and c_f is what this lacks on average on the plant, as in
-offset-free control. Parameters of its model that θ has, all by default, are the fitted ones. What
-is searched are the back-offs of the state bounds. A θ costs what the empirical model promises: the
-mean stage cost of one long rollout and the expectation of the penalty over all errors of
-prediction. Of back-offs between which the model cannot tell the smallest is taken, but where a
-bound does not bind, which costs nothing: there it is a spare one, against a plant that changes.
+The cost is tuned on the nominal model, and c_f is the mean prediction error of this on the plant,
+as in offset-free control. Parameters of its model that θ has, all by default, are the fitted ones.
+What is searched are the back-offs of the state bounds. A θ costs what the empirical model predicts:
+the mean stage cost of one long rollout and the expectation of the penalty over all errors of
+prediction. Of back-offs between which the model cannot tell the smallest is chosen, but where a
+bound is not active, which costs nothing: there it is a reserve, against a plant that changes.
 """
 
 from __future__ import annotations
@@ -23,69 +23,122 @@ from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.protocols import Array
 from learning.algorithm import Algorithm, Transition, Update
-from learning.configuration import ALL, Configuration, Count, ModelParameters
-from learning.empirical_model import (
-    GROWTH,
-    WINDOWS,
-    EmpiricalModel,
-    Features,
-    PlantData,
-    Rollout,
+from learning.checkpoint import State, part_of, prefixed
+from learning.configuration import (
+    ALL,
+    Count,
+    ModelParameters,
+    NonNegative,
+    Positive,
+    Share,
 )
+from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
+from learning.plant_data import PlantData
 from learning.prediction_errors import SortedErrors, expected_penalties
-from learning.step import moved
-
-BURN, COARSE, FINE = 300, 1800, 5300
-"""Samples of a rollout before it counts, of a short one, and of a long one."""
-LEVELS = (0.0, 2.0, 3.0, 7.0, 18.0, 50.0)
-"""Back-offs of the grid, in standard deviations of the one-step error."""
-SWEEPS = ((COARSE, (0.72, 0.85, 1.18, 1.4)), (FINE, (0.93, 1.07)), (FINE, (0.97, 1.03)))
-"""Samples of a rollout, and factors of a back-off, in the three sweeps about the best point."""
-ROOM = 0.45
-"""Largest back-off, as a share of the distance of the bounds."""
-DOUBT = 1.0
-"""Standard deviations of a difference of costs within which the model cannot tell."""
-PLATEAU = 2e-5
-"""Least deviation of such a difference, as a share of the cost."""
-WORTH = 1e-6
-"""Share of the cost that the penalty of a bound must reach for its back-off to be searched."""
-TAIL, TAIL_SAMPLES = 0.1, 120
-"""The errors' tails are widened by `TAIL` √(`TAIL_SAMPLES` / their number)."""
-SETTLING = 30
-"""Samples after an update that do not break its promise, which is of a loop that has settled."""
-BROKEN = 1.5
-"""Excess of such a mean cost, over that of the promise's dearest window, that breaks a promise."""
-REACH = 2.0
-"""Ranges of the latest states by which a rollout's mean may differ from theirs."""
-CAUTION = 120
-"""Samples of the present plant below which back-offs only grow; errors below which none tells."""
-STEADY = 1440
-"""Samples of a changed plant below which no back-off shrinks beneath what it was before."""
-SHRINKS = 0.7
-"""A back-off shrinks at most to this share of the least distance from its bound so far."""
-RECENT = 1440
-"""Latest samples by which the size of the errors is measured."""
-THINNED = 10
-"""Of so many samples of a rollout one tells what the model knows of it."""
+from learning.rollout import Rollout, RolloutSamples
+from learning.step import update_without_fit
 
 
-class ModelBasedConfiguration(Configuration):
+class ModelBasedConfiguration(EmpiricalModelConfiguration):
     """Hyperparameters of `model-based`."""
 
     model_parameters: ModelParameters = ALL
+    # when an update is due
     first_update: Count = Field(30, description="samples before the first update of θ")
     longest_interval: Count = Field(
         1440,
         description="most samples between updates, which double with the model's data, as long as "
-        "these are no more than eight times as many",
+        "these are no more than `refit_growth` times as many",
     )
-    memory: Count = Field(20_000, description="samples that the model remembers")
     exploration_samples: Count = Field(120, description="samples at the start that explore")
-    spare: float = Field(
+    settling_samples: Count = Field(
+        30,
+        description="samples after an update whose cost is not held against the predicted one, "
+        "which is of a loop that has settled",
+    )
+    cost_excess: Positive = Field(
+        1.5,
+        description="excess of a window's mean cost, over that of the rollout's worst window, at "
+        "which an update is due",
+    )
+    # what back-offs are possible
+    spare: NonNegative = Field(
         18.0,
-        ge=0,
-        description="back-off of a bound that does not bind, in standard deviations of the "
+        description="reserve back-off of a bound that is not active, in standard deviations of the "
         "one-step error; half or none of it where that would cost",
+    )
+    least_samples: Count = Field(
+        120,
+        description="samples of the present regime below which back-offs only grow; errors below "
+        "which none calls for an update",
+    )
+    steady_samples: Count = Field(
+        1440,
+        description="samples of a changed plant below which no back-off shrinks beneath what it "
+        "was before",
+    )
+    shrink_share: Share = Field(
+        0.7,
+        description="a back-off shrinks at most to this share of the least distance from its bound "
+        "so far",
+    )
+    largest_back_off: Share = Field(
+        0.45,
+        description="largest back-off, as a share of the distance of the bounds",
+    )
+    # how they are searched
+    burn_in: Count = Field(300, description="samples of a rollout before it counts")
+    coarse_rollout: Count = Field(1800, description="samples of a rollout on the grid")
+    fine_rollout: Count = Field(5300, description="samples of a rollout near the best point")
+    back_off_levels: tuple[NonNegative, ...] = Field(
+        (0.0, 2.0, 3.0, 7.0, 18.0, 50.0),
+        description="back-offs of the grid, in standard deviations of the one-step error",
+    )
+    coarse_factors: tuple[Positive, ...] = Field(
+        (0.72, 0.85, 1.18, 1.4),
+        description="factors of a back-off in the first sweep about the best point, on coarse "
+        "rollouts",
+    )
+    fine_factors: tuple[Positive, ...] = Field(
+        (0.93, 1.07),
+        description="factors in the second sweep, on fine rollouts",
+    )
+    finest_factors: tuple[Positive, ...] = Field(
+        (0.97, 1.03),
+        description="factors in the third sweep, on fine rollouts",
+    )
+    # how a cost is predicted and compared
+    tail_widening: NonNegative = Field(
+        0.1,
+        description="share by which `tail_samples` errors are widened, for tails that they lack; "
+        "in proportion to the root of 1 / their number",
+    )
+    tail_samples: Count = Field(120, description="number of errors at which it is that share")
+    recent_samples: Count = Field(
+        1440,
+        description="latest samples that say where the plant is and how large errors are",
+    )
+    state_ranges: Positive = Field(
+        2.0,
+        description="ranges of the latest states by which a rollout's mean may differ from theirs",
+    )
+    least_penalty_share: Positive = Field(
+        1e-6,
+        description="share of the cost that the penalty of a bound must reach for its back-off to "
+        "be searched",
+    )
+    doubt: NonNegative = Field(
+        1.0,
+        description="standard deviations of a difference of costs within which the model cannot "
+        "tell",
+    )
+    plateau: Positive = Field(
+        2e-5,
+        description="least deviation of such a difference, as a share of the cost",
+    )
+    cost_thinning: Count = Field(
+        10,
+        description="one in so many samples of a rollout says what the model knows of its cost",
     )
 
 
@@ -93,34 +146,38 @@ class ModelBased(Algorithm):
     """Operates with θ, fits the empirical model, searches on it, and operates on.
 
     An update is due when the model's data have doubled, at the latest after `longest_interval` or
-    an eighth of them; and as soon as samples are dearer than any of the rollout that promised θ's
+    an eighth of them; and as soon as samples cost more than any of the rollout that predicted θ's
     cost. Where the errors since the last update have a mean that the model makes improbable, the
     plant has changed, and the data from there on count. θ moves only where the model, on new noise,
-    promises less for the new one.
+    predicts less for the new one.
     """
 
     Configuration = ModelBasedConfiguration
-    KEPT = ("back_off", "_due", "model_samples", "_limits", "_floor", "_era", "_data")
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        settings, start = self.configuration, self.controller.parameters
-        self._problem = problem = Problem.from_scenario(self.scenario)
-        self._base = base = _tuned(problem, start)
-        self._features = Features(problem)
+        settings = self.configuration
+        start = self.controller.parameters
+        self._problem = Problem.from_scenario(self.scenario)
+        self._base = _tuned(self._problem, start)
+        self._features = Features(self._problem, settings.smallest_error_size)
+        # Of the fitted parameters only those that θ has reach the controller.
         labels = start.blocks.block("p").labels if "p" in start.blocks else ()
-        self._carried = problem.model.parameter_indices(labels)
-        self._rollout = Rollout(problem, start, self._features)
-        self._data = PlantData(self._features, settings.memory)
-        backed = np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]])
-        self.back_off: Array = np.maximum(backed, 0.0)
+        self._carried = self._problem.model.parameter_indices(labels)  # parameters that θ has
+        self._rollout = Rollout(self._problem, start, self._features)
+        self._data = PlantData(self._features, settings)
+        # A start that is backed off already is not given away.
+        lower = start["x_l"] - self._base["x_l"]
+        upper = self._base["x_u"] - start["x_u"]
+        self.back_off: Array = np.maximum(np.concatenate([lower, upper]), 0.0)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
         self._due = settings.first_update  # samples at the next update
-        # Samples before the plant of the latest update, and the back-offs when that plant began.
-        self._era, self._floor = 0, np.zeros_like(self.back_off)
-        self._limits: Array = np.full(len(WINDOWS), np.inf)  # of the mean cost, for each window
+        self._regime_start = 0  # of the latest update
+        self._floor = np.zeros_like(self.back_off)  # back-offs when that regime began
+        # Of the mean cost, for each window of the change detection.
+        self._limits: Array = np.full(len(settings.change_windows), np.inf)
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
 
@@ -131,134 +188,238 @@ class ModelBased(Algorithm):
 
     def observe(self, transition: Transition) -> Update | None:
         """Keep a transition; move θ when an update is due."""
+        # Every sample is kept; whether one calls for an update is asked once a window.
         data = self._data
         data.add(transition)
-        judged = (data.count - data.fitted) % WINDOWS[0] == 0
-        alarmed = judged and data.model is not None and self._alarmed(data.model)
-        return self._update(alarmed) if alarmed or data.count >= self._due else None
+        model = data.model
+        alarmed = False
+        if model is not None and data.since_fit % self.configuration.change_windows[0] == 0:
+            alarmed = self.alarmed(model)
+        if alarmed or data.count >= self._due:
+            return self._update(alarmed)
+        return None
 
-    def _alarmed(self, model: EmpiricalModel) -> bool:
-        """Whether the promise is broken or, on new data, the plant is another."""
-        data = self._data
-        if len(model.residuals) < CAUTION:
+    def alarmed(self, model: EmpiricalModel) -> bool:
+        """Whether samples cost more than was predicted or, on new data, the plant is another."""
+        settings = self.configuration
+        if len(model.residuals) < settings.least_samples:
             return False
-        predicted, h, errors, designs = data.errors()
-        costs = ExpectedCosts(self._problem, model)(predicted, h)[0]
-        settled = len(costs) > SETTLING
-        broken = [
-            window
-            for window, limit in zip(WINDOWS, self._limits, strict=True)
-            if settled and window <= len(costs) and costs[-window:].mean() > limit
-        ]
-        return data.changed(errors, designs, broken) or bool(broken)
+        predictions = self._data.predictions()
+        expected = ExpectedCosts(self._problem, model, settings)
+        costs, _ = expected(predictions.outputs, predictions.h)
+        # Costs by the model's expectation: realised penalties are too rare.
+        too_costly = []
+        if len(costs) > settings.settling_samples:
+            for window, limit in zip(settings.change_windows, self._limits, strict=True):
+                if window <= len(costs) and costs[-window:].mean() > limit:
+                    too_costly.append(window)
+        return self._data.changed(predictions, too_costly) or bool(too_costly)
 
-    def _least(self, present: Array, inputs: Array) -> Array:
-        """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
+    def _update(self, alarmed: bool) -> Update:
+        """Fit the model, search on it, and move θ where the model predicts less for the new one."""
+        settings = self.configuration
+        data = self._data
+        model = data.fit()
+        inputs, _ = data.present
+        if data.regime_start != self._regime_start:
+            self._regime_start = data.regime_start
+            self._floor = self.back_off
+        # Day by day an optimum moves little: then the search begins at the present back-offs.
+        # Without limits the present cost was never predicted.
+        known = bool(np.isfinite(self._limits).all())
+        settled = data.age > settings.longest_interval and not alarmed and known
+        longest = max(settings.longest_interval, data.age // settings.refit_growth)
+        interval = min(data.age, longest)
+        # Data double between updates, then grow by a share.
+        self._due = data.count + max(interval, settings.first_update)
+
+        present = self.controller.parameters
+        latest, _ = data.latest(settings.recent_samples)
+        base, gained = self.corrected(present, model, inputs[-settings.recent_samples :])
+        # What c_f and the parameters correct, back-offs need not hold any more.
+        shift = np.concatenate([gained, -gained])
+        kept = np.maximum(self.back_off + shift, 0.0)
+        least = self.least_back_offs(kept, inputs)
+        search = BackOffOnModel(
+            self._problem, self._rollout, base, model, latest, settings, self.rng
+        )
+        levels = () if settled else settings.back_off_levels
+        best = search.best(kept, least, levels)
+
+        # The comparison that decides meets noise that no search has seen.
+        new = search.theta(best)
+        search.draw(settings.fine_rollout)
+        cost_of_new, cost_of_present = search.predicted_costs([new, present.theta])
+        better = search.excess(cost_of_new, cost_of_present) <= 0
+        self._limits = (cost_of_new if better else cost_of_present).limits
+        if not np.isfinite(self._limits).all():
+            # Nothing is known of the present cost: look again soon.
+            self._due = min(self._due, data.count + settings.change_windows[-2])
+        if better:
+            self.back_off = best
+            self.controller.theta = new
+        self.model_samples += search.n_samples
+        end = self.controller.theta
+        return update_without_fit(present.blocks, present.theta, end, refused=not better)
+
+    def least_back_offs(self, present: Array, inputs: Array) -> Array:
+        """Least back-offs that the data allow.
 
         A present one shrinks little beyond the state that came closest to its bound: what lies
         behind it the model only extrapolates. Of few samples none shrinks, nor while they explore,
         which no rollout does. A plant that has changed may go on to: until it has been the same for
-        `STEADY` samples none shrinks below what it was before.
+        `steady_samples` none shrinks below what it was before.
+
+        Args:
+            present: back-offs, (2n,).
+            inputs: (s, a) of the present regime, (M, n+m).
         """
+        settings = self.configuration
         problem = self._problem
-        if self.explores or len(inputs) < CAUTION:
+        if self.explores or len(inputs) < settings.least_samples:
             return present
-        changing = self._era > 0 and len(inputs) < STEADY
-        floor = np.minimum(self._floor, present) if changing else np.zeros_like(present)
+        floor = np.zeros_like(present)
+        if self._regime_start > 0 and len(inputs) < settings.steady_samples:
+            floor = np.minimum(self._floor, present)
+        # What the plant has shown: its distances from the true bounds.
         states = inputs[:, : problem.n_states]
-        rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
-        least: Array = np.clip(SHRINKS * rooms.min(axis=0), floor, present)
+        above = states - problem.state_lower
+        below = problem.state_upper - states
+        distances = np.concatenate([above, below], axis=1)
+        closest = distances.min(axis=0)
+        least: Array = np.clip(settings.shrink_share * closest, floor, present)
         return least
 
-    def _corrected(
-        self, present: Parameters, model: EmpiricalModel, inputs: Array
+    def corrected(
+        self,
+        present: Parameters,
+        model: EmpiricalModel,
+        inputs: Array,
     ) -> tuple[Parameters, Array]:
-        """θ before its back-offs, and what the controller's predictions of s₊ gain by it, (n,).
+        """θ before its back-offs, with the fitted model parameters and offset.
 
-        Its model parameters are the fitted ones, c_f is what is lacking with them on average at
-        inputs (M, n+m) of the present plant. Of few samples the present ones stay.
+        c_f is the mean prediction error with them. Of few samples the present ones stay.
+
+        Args:
+            present: θ.
+            model: of the present regime.
+            inputs: (s, a) of it, (M, n+m).
+
+        Returns:
+            The new θ, and what the controller's predictions of s₊ gain by it, (n,).
         """
-        kept = {name: present[name] for name in ("p", "c_f") if name in present.blocks}
-        if len(inputs) < CAUTION:
+        kept = {}
+        for name in ("p", "c_f"):
+            if name in present.blocks:
+                kept[name] = present[name]
+        if len(inputs) < self.configuration.least_samples:
             return self._base.replace(kept), np.zeros_like(present["c_f"])
-        before, after = np.zeros(self._features.count), np.zeros(self._features.count)
+        # Errors of the nominal parameters in the controller's model, before and after.
+        before = np.zeros(self._features.n_parameters)
+        after = np.zeros(self._features.n_parameters)
         if "p" in kept:
             nominal = self._problem.model.nominal_parameters[self._carried]
             before[self._carried] = kept["p"] / nominal - 1
             after[self._carried] = model.mean[self._carried]
             kept["p"] = nominal * (1 + after[self._carried])
-        kept["c_f"] = model.lack(inputs, after)
-        return self._base.replace(kept), model.lack(inputs, before) - present["c_f"]
+        # Offset-free: what the controller's model still lacks on average.
+        kept["c_f"] = model.nominal_prediction_error(inputs, after)
+        gained = model.nominal_prediction_error(inputs, before) - present["c_f"]
+        return self._base.replace(kept), gained
 
-    def _update(self, alarmed: bool) -> Update:
-        data, longest = self._data, self.configuration.longest_interval
-        model = data.fit()
-        inputs, _ = data.present
-        age = data.count - data.era
-        if data.era != self._era:
-            self._era, self._floor = data.era, self.back_off
-        # Day by day an optimum moves little: then the search begins at the present back-offs.
-        settled = age > longest and not alarmed and np.isfinite(self._limits).all()
-        interval = min(age, max(longest, age // GROWTH))
-        self._due = data.count + max(interval, self.configuration.first_update)
-        latest, _ = data.latest(RECENT)
-        spare, rng = self.configuration.spare, self.rng
-        present = self.controller.parameters
-        base, more = self._corrected(present, model, inputs[-RECENT:])
-        kept = np.maximum(self.back_off + np.concatenate([more, -more]), 0.0)
-        search = BackOffs(self._problem, self._rollout, base, model, latest, spare, rng)
-        found = search.best(kept, self._least(kept, inputs), () if settled else LEVELS)
-        new = search.theta(found)
-        search.draw(FINE)
-        promise, held = search.promises([new, present.theta])
-        better = search.excess(promise, held) <= 0
-        self._limits = (promise if better else held).limits
-        if not np.isfinite(self._limits).all():
-            self._due = min(self._due, data.count + WINDOWS[-2])
-        if better:
-            self.back_off = found
-            self.controller.theta = new
-        self.model_samples += search.samples
-        end = self.controller.theta
-        return moved(present.blocks, present.theta, end, refused=not better)
+    def state_dict(self) -> State:
+        """Back-offs, schedule, limits and data."""
+        return {
+            "back_off": self.back_off,
+            "due": self._due,
+            "model_samples": self.model_samples,
+            "limits": self._limits,
+            "floor": self._floor,
+            "regime_start": self._regime_start,
+            **prefixed("data", self._data.state_dict()),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        self.back_off = state["back_off"]
+        self._due = state["due"]
+        self.model_samples = state["model_samples"]
+        self._limits = state["limits"]
+        self._floor = state["floor"]
+        self._regime_start = state["regime_start"]
+        self._data.load_state_dict(part_of(state, "data"))
 
 
-class Promise(NamedTuple):
-    """Mean `cost` that a model promises, and its derivative by the model's coefficients, `row`.
+class PredictedCost(NamedTuple):
+    """What a model predicts of a θ.
 
-    `limits` are those of the mean cost of so many samples as each of `WINDOWS`.
+    Attributes:
+        cost: mean per sample; infinite where the rollout is lost.
+        derivative: of the mean stage cost by the model's coefficients, (q,).
+        limits: of the mean cost of so many samples as each window of the change detection has.
     """
 
     cost: float
-    row: Array
+    derivative: Array
     limits: Array
 
 
 class ExpectedCosts:
     """Costs of samples that a model predicts, the penalty by its expectation over all residuals."""
 
-    def __init__(self, problem: Problem, model: EmpiricalModel) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        model: EmpiricalModel,
+        settings: ModelBasedConfiguration,
+    ) -> None:
         self.penalty = problem.penalty
+        # Penalties are of states; the last output is the cost.
         errors = model.residuals[:, : problem.n_states]
         self._errors = SortedErrors(errors)
-        self._widened = 1 + TAIL * (TAIL_SAMPLES / len(errors)) ** 0.5
+        # Few errors have no tails: those that they have are widened.
+        fewness = (settings.tail_samples / len(errors)) ** 0.5
+        self._widened = 1 + settings.tail_widening * fewness
 
     def __call__(self, predicted: Array, h: Array) -> tuple[Array, Array]:
-        """Costs (M,), and the penalty of each bound in it, (2n, M), of predictions and h (M, K)."""
-        due = expected_penalties(self.penalty, predicted[:, :-1], self._errors, self._widened * h)
+        """Expected costs.
+
+        Args:
+            predicted: (s₊, ℓ), (M, K).
+            h: sizes of the errors, (M, K).
+
+        Returns:
+            Costs (M,), and the penalty of each bound in them, (2n, M).
+        """
+        states = predicted[:, :-1]
+        sizes = self._widened * h
+        due = expected_penalties(self.penalty, states, self._errors, sizes)
+        # From (state, bound) to lower bounds and then upper ones, as back-offs are.
         penalties = due.swapaxes(0, 1).reshape(-1, len(predicted))
         return predicted[:, -1] + penalties.sum(axis=0), penalties
 
 
-class BackOffs:
+class BackOffOnModel:
     """Searches back-offs δ (2n,) of the lower, then the upper state bounds on an empirical model.
 
-    `visited` are the latest inputs (s, a), (M, n+m), oldest first; rollouts begin at the last one's
-    state, and are lost where they cost more on average than the dearest of these samples, or their
-    mean state is far from that of `RECENT` of them: the model has gone where the plant has not
-    been. All θ meet the same noise until the next `draw`. δ are multiples of a twentieth of the
-    error's order of magnitude, so that no last digit decides. `spare` is the back-off, in standard
-    deviations of the error, of a bound that does not bind.
+    Rollouts begin at the last of the visited states, and are lost where they cost more on average
+    than the most expensive of the visited samples, or their mean state is far from that of these
+    samples: the model has gone where the plant has not been. All θ meet the same noise until the
+    next `draw`. δ are multiples of a twentieth of the error's order of magnitude, so that no last
+    digit decides.
+
+    Args:
+        problem: bounds and penalty.
+        rollout: of the problem's controller.
+        base: θ before its back-offs.
+        model: plays the plant.
+        visited: the latest inputs (s, a), (M, n+m), oldest first.
+        settings: of the search.
+        rng: draws the noise.
+
+    Attributes:
+        n_samples: of rollouts so far.
+        unit: of the back-offs, the standard deviation of the one-step error, (2n,).
     """
 
     def __init__(
@@ -268,136 +429,241 @@ class BackOffs:
         base: Parameters,
         model: EmpiricalModel,
         visited: Array,
-        spare: float,
+        settings: ModelBasedConfiguration,
         rng: np.random.Generator,
     ) -> None:
         n = problem.n_states
-        self._spare = spare
-        self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
-        self._start, self._rng = visited[-1, :n], rng
-        self._costs = ExpectedCosts(problem, model)
+        self._settings = settings
+        self._problem = problem
+        self._rollout = rollout
+        self._base = base
+        self._model = model
+        self._rng = rng
+        self._costs = ExpectedCosts(problem, model, settings)
         predicted, h, _ = model.predict(visited)
-        self._dearest = self._costs(predicted, h)[0].max()
+        # What no sample of the plant has cost, a rollout does not know.
+        self._largest_cost = self._costs(predicted, h)[0].max()
         states = visited[:, :n]
-        self._centre, self._reach = states.mean(axis=0), REACH * np.ptp(states, axis=0)
-        if len(visited) < RECENT:  # the plant has not settled yet
-            self._reach[:] = np.inf
-        deviation = model.residuals[:, :n].std(axis=0) * h[:, :n].mean(axis=0)
-        self._unit = np.tile(np.maximum(deviation, 1e-6 * problem.units.state), 2)
-        self._most = np.tile(ROOM * (problem.state_upper - problem.state_lower), 2)
-        self._worth = np.zeros(2 * n)  # largest penalty of each bound so far, as a share of cost
-        self.samples = 0
-        self.draw(COARSE)
+        self._start = visited[-1, :n]
+        self._centre = states.mean(axis=0)
+        self._reach = settings.state_ranges * np.ptp(states, axis=0)
+        if len(visited) < settings.recent_samples:
+            self._reach[:] = np.inf  # the plant has not settled yet
+        # The size of a one-step error, at least a millionth of the state's own unit.
+        residual = model.residuals[:, :n].std(axis=0)
+        deviation = residual * h[:, :n].mean(axis=0)
+        deviation = np.maximum(deviation, 1e-6 * problem.units.state)
+        self.unit = np.tile(deviation, 2)
+        distance = problem.state_upper - problem.state_lower
+        self._most = np.tile(settings.largest_back_off * distance, 2)
+        self._penalty_share = np.zeros(2 * n)  # largest of each bound so far
+        self.n_samples = 0
+        self.draw(settings.coarse_rollout)
 
     def draw(self, steps: int) -> None:
-        """Take new noise for rollouts of so many samples."""
-        residuals = len(self._model.residuals)
-        self._picks = self._rng.integers(residuals, size=steps, dtype=np.int32)
-        self._known: dict[bytes, Promise] = {}  # on this noise, by θ
+        """Draw new noise for rollouts of so many samples."""
+        n_residuals = len(self._model.residuals)
+        self._picks = self._rng.integers(n_residuals, size=steps, dtype=np.int32)
+        self._known: dict[bytes, PredictedCost] = {}  # on this noise, by θ
 
     def theta(self, delta: Array) -> Array:
         """θ with its bounds backed off by δ."""
-        n, base = self._problem.n_states, self._base
-        moved = {"x_l": base["x_l"] + delta[:n], "x_u": base["x_u"] - delta[n:]}
-        return base.replace(moved).theta
+        n = self._problem.n_states
+        lower = self._base["x_l"] + delta[:n]
+        upper = self._base["x_u"] - delta[n:]
+        return self._base.replace({"x_l": lower, "x_u": upper}).theta
 
-    def promises(self, thetas: Sequence[Array]) -> list[Promise]:
-        """What the model promises of each θ; infinite cost where the rollout is lost."""
-        new = {key: theta for theta in thetas if (key := theta.tobytes()) not in self._known}
+    def predicted_costs(self, thetas: Sequence[Array]) -> list[PredictedCost]:
+        """What the model predicts of each θ, (n_θ,) each; infinite where the rollout is lost."""
+        new = {}
+        for theta in thetas:
+            key = theta.tobytes()
+            if key not in self._known:
+                new[key] = theta
         rollouts = self._rollout(list(new.values()), self._start, self._model, self._picks)
-        self._known |= {
-            key: self._promise(*parts) for key, parts in zip(new, rollouts, strict=True)
-        }
+        for key, samples in zip(new, rollouts, strict=True):
+            self._known[key] = self._predicted_cost(samples)
         return [self._known[theta.tobytes()] for theta in thetas]
 
-    def _promise(self, *parts: Array) -> Promise:
-        model = self._model
-        self.samples += len(parts[0])
-        inputs, predicted, h = (part[BURN:] for part in parts)
-        lost = Promise(np.inf, np.zeros_like(model.mean), np.full(len(WINDOWS), np.inf))
-        if len(inputs) < len(self._picks) - BURN or not np.isfinite(predicted).all():
+    def _predicted_cost(self, samples: RolloutSamples) -> PredictedCost:
+        settings = self._settings
+        self.n_samples += len(samples.inputs)
+        inputs = samples.inputs[settings.burn_in :]
+        predicted = samples.predicted[settings.burn_in :]
+        h = samples.h[settings.burn_in :]
+        windows = settings.change_windows
+        derivative = np.zeros_like(self._model.mean)
+        lost = PredictedCost(np.inf, derivative, np.full(len(windows), np.inf))
+        complete = len(inputs) >= len(self._picks) - settings.burn_in
+        if not complete or not np.isfinite(predicted).all():
             return lost
+        # A rollout counts once it has settled.
         costs, penalties = self._costs(predicted, h)
-        stage, cost = float(predicted[:, -1].mean()), float(costs.mean())
-        size = max(abs(stage), np.finfo(np.float64).eps)
-        self._worth = np.maximum(self._worth, penalties.mean(axis=1) / size)
-        away = np.abs(inputs[:, : len(self._start)].mean(axis=0) - self._centre)
-        if cost > self._dearest or (away > self._reach).any():
+        cost = float(costs.mean())
+        stage_cost = float(predicted[:, -1].mean())
+        size = max(abs(stage_cost), np.finfo(np.float64).eps)
+        # A bound shows in lost rollouts too.
+        penalty_share = penalties.mean(axis=1) / size
+        self._penalty_share = np.maximum(self._penalty_share, penalty_share)
+        mean_state = inputs[:, : len(self._start)].mean(axis=0)
+        away = np.abs(mean_state - self._centre)
+        if cost > self._largest_cost or (away > self._reach).any():
             return lost
-        dearest = np.array([_moving_mean(costs, window).max(initial=cost) for window in WINDOWS])
-        limits = cost + BROKEN * (dearest - cost)
-        return Promise(cost, model.cost_row(inputs[::THINNED]), limits)
+        # What the plant may cost before the prediction is called wrong.
+        worst = []
+        for window in windows:
+            means = _moving_mean(costs, window)
+            worst.append(means.max(initial=cost))
+        excess = np.array(worst) - cost
+        limits = cost + settings.cost_excess * excess
+        some_inputs = inputs[:: settings.cost_thinning]
+        derivative = self._model.cost_derivative(some_inputs)
+        return PredictedCost(cost, derivative, limits)
 
-    def excess(self, one: Promise, other: Promise) -> float:
+    def excess(self, one: PredictedCost, other: PredictedCost) -> float:
         """Cost of one above another's, in deviations of what the model knows of the difference."""
         if not np.isfinite(one.cost):
             return np.inf
-        row = one.row - other.row
-        deviation = float(row @ self._model.covariance @ row) ** 0.5
-        return float((one.cost - other.cost) / max(deviation, PLATEAU * abs(one.cost)))
+        # Both costs err alike where they depend alike on the coefficients.
+        derivative = one.derivative - other.derivative
+        variance = float(derivative @ self._model.covariance @ derivative)
+        least = self._settings.plateau * abs(one.cost)
+        deviation = max(variance**0.5, least)
+        return float((one.cost - other.cost) / deviation)
 
-    def best(self, delta: Array, least: Array, levels: Sequence[float]) -> Array:
-        """The smallest δ, not below `least`, whose cost the model cannot tell from the least one.
+    def best(
+        self,
+        delta: Array,
+        least: Array,
+        levels: Sequence[float],
+    ) -> Array:
+        """The smallest δ whose cost the model cannot tell from the least one.
 
-        First a grid of `levels`, in standard deviations of the one-step error, at once over the
-        bounds whose penalty shows anywhere, up to two, and one by one over what others there are;
-        without levels δ alone. Then sweeps over each about the best point, on longer rollouts.
-        Bounds whose penalty shows nowhere have a spare back-off.
+        First a grid at once over the active bounds, those whose penalty shows anywhere, up to two,
+        and one by one over what others there are. Then sweeps over each about the best point, on
+        longer rollouts. Bounds whose penalty shows nowhere have a reserve back-off.
+
+        Args:
+            delta: present δ, (2n,).
+            least: least δ, (2n,).
+            levels: of the grid, in standard deviations of the one-step error; without any the
+                search begins at δ alone.
         """
-        grids = [
-            self._rounded(i, [max(level * unit, least[i]) for level in levels])
-            for i, unit in enumerate(self._unit)
-        ]
+        settings = self._settings
+        # Levels of the grid, none below what the data allow.
+        grids = []
+        for i, unit in enumerate(self.unit):
+            wanted = [max(level * unit, least[i]) for level in levels]
+            grids.append(self._rounded(i, wanted))
         active: list[int] = []
         points = [delta, least]
         while True:
-            delta = self._least(points)
-            order = np.argsort(-self._worth)
-            new = [int(i) for i in order if self._worth[i] > WORTH and i not in active]
-            if not new:
+            delta = self._cheapest(points)
+            newly_active = self._next_active(active)
+            if newly_active is None:
                 break
-            active.append(new[0])
+            active.append(newly_active)
+            # Two bounds at once: their back-offs depend on each other.
             together = active if len(active) <= 2 else active[-1:]
-            corners = product(*(grids[i] for i in together))
-            points = [delta, *(_with(delta, together, corner) for corner in corners)]
-        for steps, factors in SWEEPS:
+            points = [delta]
+            levels_together = [grids[i] for i in together]
+            for corner in product(*levels_together):
+                points.append(_with(delta, together, corner))
+
+        sweeps = [
+            (settings.coarse_rollout, settings.coarse_factors),
+            (settings.fine_rollout, settings.fine_factors),
+            (settings.fine_rollout, settings.finest_factors),
+        ]
+        for steps, factors in sweeps:
+            # Longer rollouts need new noise; all θ meet the same again.
             if steps > len(self._picks):
                 self.draw(steps)
             for i in active:
-                wanted = [delta[i] * factor for factor in factors] if delta[i] else [self._unit[i]]
-                values = self._rounded(i, [max(value, least[i]) for value in wanted])
-                delta = self._least([delta, *(_with(delta, [i], [value]) for value in values)])
-        for i in set(range(len(delta))) - set(active):
-            delta = self._spared(delta, i)
+                delta = self._swept(delta, i, least[i], factors)
+        for i in range(len(delta)):
+            if i not in active:
+                delta = self._with_reserve(delta, i)
         return delta
 
-    def _spared(self, delta: Array, i: int) -> Array:
-        """δ with as much of the spare back-off of a bound that does not bind as costs nothing."""
-        values = self._rounded(i, [share * self._spare * self._unit[i] for share in (0.5, 1.0)])
-        points = [delta, *(_with(delta, [i], [value]) for value in values if value > delta[i])]
-        promises = self.promises([self.theta(point) for point in points])
-        free = [self.excess(promise, promises[0]) <= DOUBT for promise in promises]
-        return points[max(np.flatnonzero(free), default=0)]
+    def _next_active(self, active: Sequence[int]) -> int | None:
+        """The bound of largest penalty that is not searched yet and shows; None without one."""
+        for i in np.argsort(-self._penalty_share).tolist():
+            shows = self._penalty_share[i] > self._settings.least_penalty_share
+            if shows and i not in active:
+                return int(i)
+        return None
+
+    def _swept(
+        self,
+        delta: Array,
+        i: int,
+        least: float,
+        factors: Sequence[float],
+    ) -> Array:
+        """The cheapest of δ and of those with factors of the back-off of a bound."""
+        wanted = [self.unit[i]]
+        if delta[i]:
+            wanted = [delta[i] * factor for factor in factors]
+        values = self._rounded(i, [max(value, least) for value in wanted])
+        points = [delta]
+        for value in values:
+            points.append(_with(delta, [i], [value]))
+        return self._cheapest(points)
+
+    def _with_reserve(self, delta: Array, i: int) -> Array:
+        """δ with as much of the reserve back-off of a bound that is not active as costs nothing."""
+        # Half of it, then all: the largest that costs nothing.
+        reserve = self._settings.spare * self.unit[i]
+        points = [delta]
+        for value in self._rounded(i, [0.5 * reserve, 1.0 * reserve]):
+            if value > delta[i]:
+                points.append(_with(delta, [i], [value]))
+        costs = self.predicted_costs([self.theta(point) for point in points])
+        free = delta
+        for point, cost in zip(points, costs, strict=True):
+            if self.excess(cost, costs[0]) <= self._settings.doubt:
+                free = point
+        return free
 
     def _rounded(self, i: int, values: Sequence[float]) -> list[float]:
         """Back-offs of a bound as multiples of its step, within its room, ascending."""
-        step = 10.0 ** np.floor(np.log10(self._unit[i])) / 20
-        return sorted({float(min(round(v / step) * step, self._most[i])) for v in values})
+        # A twentieth of the error's order of magnitude.
+        step = 10.0 ** np.floor(np.log10(self.unit[i])) / 20
+        rounded = set()
+        for value in values:
+            multiple = round(value / step) * step
+            rounded.add(float(min(multiple, self._most[i])))
+        return sorted(rounded)
 
-    def _least(self, points: Sequence[Array]) -> Array:
-        promises = self.promises([self.theta(point) for point in points])
-        least = min(promises, key=lambda promise: promise.cost)
-        told = [self.excess(promise, least) <= DOUBT for promise in promises]
-        close = [point for point, like in zip(points, told, strict=True) if like]
-        return min(close or points[:1], key=lambda point: float((point / self._unit).sum()))
+    def _cheapest(self, points: Sequence[Array]) -> Array:
+        """The smallest of the points whose cost the model cannot tell from the least one."""
+        costs = self.predicted_costs([self.theta(point) for point in points])
+        least = min(costs, key=lambda predicted: predicted.cost)
+        # Of what the model cannot tell apart, the smallest back-off.
+        close = []
+        for point, cost in zip(points, costs, strict=True):
+            if self.excess(cost, least) <= self._settings.doubt:
+                close.append(point)
+
+        def size(point: Array) -> float:
+            return float((point / self.unit).sum())
+
+        return min(close or points[:1], key=size)
 
 
 def _moving_mean(costs: Array, window: int) -> Array:
+    """Means of so many costs in a row."""
     total: Array = np.concatenate([[0.0], costs]).cumsum()
     return (total[window:] - total[:-window]) / window
 
 
-def _with(delta: Array, bounds: Sequence[int], values: Sequence[float]) -> Array:
+def _with(
+    delta: Array,
+    bounds: Sequence[int],
+    values: Sequence[float],
+) -> Array:
+    """δ with the values of some bounds changed."""
     changed = delta.copy()
     changed[list(bounds)] = values
     return changed
@@ -409,5 +675,8 @@ def _tuned(problem: Problem, start: Parameters) -> Parameters:
         tuned = tune(problem, start.blocks).parameters
     except TuningError:
         return start
-    kept = ("c_lambda", "c_f", "w_sigma", "W_sigma", "p")
-    return tuned.replace({name: start[name] for name in kept if name in start.blocks})
+    kept = {}
+    for name in ("c_lambda", "c_f", "w_sigma", "W_sigma", "p"):
+        if name in start.blocks:
+            kept[name] = start[name]
+    return tuned.replace(kept)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from cmaes import CMA
@@ -13,22 +12,23 @@ from scipy.linalg import expm
 from controllers.theta import Parameters
 from cosim.protocols import Vector
 from cosim.scenario import Scenario
-from learning.algorithm import Transition, Update
-from learning.baselines import GreedyConfiguration
-from learning.configuration import Count, Positive
-from learning.episodes import Episode, Planned, Told
-from learning.step import HESSIANS, moved
+from learning.algorithm import Algorithm, Transition, Update
+from learning.checkpoint import State
+from learning.configuration import Configuration, Count, GreedyConfiguration, Positive
+from learning.step import HESSIANS, update_without_fit
 
 
 class PolicySearchConfiguration(GreedyConfiguration):
-    """Settings of the policy search."""
+    """Hyperparameters of the policy search."""
 
     population: Count = Field(13, description="candidates of a generation")
-    episode: Count = Field(500, description="plant samples that judge a candidate")
+    episode: Count = Field(500, description="plant samples that evaluate a candidate")
     spread: Positive = Field(0.5, description="σ at the start, in the coordinates of the search")
     width: Positive = Field(
-        0.02, description="unit of states and actions, as a share of the width of their bounds"
+        0.02,
+        description="unit of states and actions, as a share of the width of their bounds",
     )
+    offset_share: Positive = Field(0.1, description="unit of c_f, as a share of that of states")
 
 
 class Coordinates:
@@ -36,23 +36,38 @@ class Coordinates:
 
     A Hessian B = LLᵀ becomes L exp(Z) Lᵀ, positive definite for every symmetric Z; its linear term
     b − 2B·δ; c_f, x_l and x_u move by δ. δ is in units of the bounds' width (of the reference where
-    one is infinite), a tenth of that for c_f. Initial cost and slack weights stay.
+    one is infinite), a share of that for c_f. Initial cost and slack weights stay.
+
+    Args:
+        start: θ(0).
+        scenario: its bounds.
+        width: unit of states and actions, as a share of the width of their bounds.
+        offset_share: unit of c_f, as a share of that of states.
+
+    Attributes:
+        size: number of coordinates.
     """
 
-    def __init__(self, start: Parameters, scenario: Scenario, width: float) -> None:
+    def __init__(
+        self,
+        start: Parameters,
+        scenario: Scenario,
+        width: float,
+        offset_share: float = 0.1,
+    ) -> None:
         self._start = start
         span = scenario.state_upper - scenario.state_lower
+        # A state without bounds has the size of its reference.
         span = np.where(np.isfinite(span), span, np.abs(scenario.reference_state))
         states = width * np.where(span > 0, span, 1.0)
-        both = np.concatenate([states, scenario.action_upper - scenario.action_lower])
-        both[states.size :] *= width
+        actions = width * (scenario.action_upper - scenario.action_lower)
         self._factors = {name: np.linalg.cholesky(start[name]) for name in HESSIANS}
         self._units = {
             "B_Vf": np.ones(start.blocks.block("B_Vf").size),
             "b_Vf": states,
             "B_l": np.ones(start.blocks.block("B_l").size),
-            "b_l": both,
-            "c_f": 0.1 * states,
+            "b_l": np.concatenate([states, actions]),
+            "c_f": offset_share * states,
             "x_l": states,
             "x_u": states,
         }
@@ -60,79 +75,120 @@ class Coordinates:
 
     def theta(self, z: Vector) -> Parameters:
         """θ at z, (size,); x_l is kept below x_u."""
-        start, values, place = self._start, {}, 0
+        start = self._start
+        values = {}
+        first = 0
         for name, unit in self._units.items():
-            moved, place = unit * z[place : place + unit.size], place + unit.size
+            # Each block takes its own coordinates off the vector.
+            delta = unit * z[first : first + unit.size]
+            first += unit.size
             if name in HESSIANS:
-                symmetric = start.blocks.block(name).unpack(moved)
+                symmetric = start.blocks.block(name).unpack(delta)
                 matrix = self._factors[name] @ expm(symmetric) @ self._factors[name].T
                 values[name] = (matrix + matrix.T) / 2
             elif name.startswith("b_"):
-                values[name] = start[name] - 2 * start["B_" + name[2:]] @ moved
+                hessian = "B_" + name[2:]
+                values[name] = start[name] - 2 * start[hessian] @ delta
             else:
-                values[name] = start[name] + moved
+                values[name] = start[name] + delta
+        # A candidate without a feasible state would only fail.
         crossed = values["x_l"] >= values["x_u"]
         for name in ("x_l", "x_u"):
             values[name] = np.where(crossed, start[name], values[name])
         return start.replace(values)
 
 
-class PolicySearch(Planned):
+class PolicySearch(Algorithm):
     """CMA-ES (Hansen) on the mean cost of stretches of operation, one for each candidate.
 
     A stretch begins where the last one ended; its first samples, as many as the horizon has, settle
-    and do not count. The mean of the search distribution is what the run hands over; the part of a
-    generation that the budget leaves over changes nothing.
+    and do not count. The final θ is the mean of the search distribution; the part of a generation
+    that the budget leaves over changes nothing.
     """
 
-    Configuration = PolicySearchConfiguration
+    Configuration: ClassVar[type[Configuration]] = PolicySearchConfiguration
+    configuration: PolicySearchConfiguration
+    explores = False
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        start, width = self.controller.parameters, self.configuration.width
-        self._coordinates = Coordinates(start, self.scenario, width)
-        self.theta = self._coordinates.theta(np.zeros(self._coordinates.size)).theta
-        settling = min(self.scenario.controller.horizon, self.configuration.episode - 1)
-        self._settling = 0 if self.asks_for == "simulator" else settling
-        self.follow(self._generations())
-
-    def _generations(self) -> Iterator[Episode]:
-        settings, count = self.configuration, self.configuration.population
-        search = CMA(
+        settings = self.configuration
+        start = self.controller.parameters
+        self._blocks = start.blocks
+        self._coordinates = Coordinates(start, self.scenario, settings.width, settings.offset_share)
+        self._settling = min(self.scenario.controller.horizon, settings.episode - 1)
+        self._search = CMA(
             mean=np.zeros(self._coordinates.size),
             sigma=settings.spread,
-            population_size=count,
+            population_size=settings.population,
             seed=int(self.rng.integers(2**31)),
         )
-        while True:
-            population = [search.ask() for _ in range(count)]
-            noise, judged = int(self.rng.integers(2**63)), []
-            for z in population:
-                theta = self._coordinates.theta(z).theta
-                yield (stretch := Episode(theta, settings.episode, noise))
-                judged.append((z, stretch.answer["cost"]))
-            search.tell(judged)
-            # θ at the mean of the search distribution.
-            self.theta = self._coordinates.theta(search.mean).theta
+        self.theta: Vector = self._coordinates.theta(np.zeros(self._coordinates.size)).theta
+        """θ at the mean of the search distribution, (n_θ,); the controller carries a candidate."""
+        self._generations: list[list[float]] = []  # costs of all complete generations
+        self._evaluated: list[float] = []  # costs of the open generation's candidates so far
+        self._costs: list[float] = []  # samples of the present stretch
+        self._ask()
+        self._try_candidate()
 
-    def told(self) -> Told:
-        """Mean cost of the stretch once it has settled."""
-        costs = self._episode.costs[self._settling :]
-        return {"cost": float(np.cumsum(costs)[-1]) / len(costs)}
+    def _ask(self) -> None:
+        """Draw the candidates of a generation."""
+        self._population = [self._search.ask() for _ in range(self.configuration.population)]
 
-    def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
-        """Count a sample's cost; the step of θ is that of the mean."""
-        before, update = self.theta, super().observe(transition, cost)
-        if update is None:
+    def _try_candidate(self) -> None:
+        """Set the controller's θ to that of the next candidate."""
+        z = self._population[len(self._evaluated)]
+        self.controller.theta = self._coordinates.theta(z).theta
+
+    def _tell(self, costs: list[float]) -> None:
+        """Move the search distribution by the costs of a generation, and draw the next."""
+        self._generations.append(costs)
+        self._search.tell(list(zip(self._population, costs, strict=True)))
+        self._ask()
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Count a sample's cost; the last one of a stretch begins the next candidate's."""
+        return self._count(transition.cost)
+
+    def failed(self, cost: float) -> Update | None:
+        """Count the cost of a sample at which the controller failed."""
+        return self._count(cost)
+
+    def _count(self, cost: float) -> Update | None:
+        self._costs.append(cost)
+        if len(self._costs) < self.configuration.episode:
             return None
-        blocks = self.controller.parameters.blocks
-        return update._replace(step=moved(blocks, before, self.theta).step)
+        # The first samples are of the candidate before.
+        settled = self._costs[self._settling :]
+        self._evaluated.append(float(np.cumsum(settled)[-1]) / len(settled))
+        self._costs = []
+        mean_before = self.theta
+        candidate_before = self.controller.theta
+        if len(self._evaluated) == self.configuration.population:
+            self._tell(self._evaluated)
+            self._evaluated = []
+            self.theta = self._coordinates.theta(self._search.mean).theta
+        self._try_candidate()
+        # The log's step is that of the mean, its eigenvalue that of the candidate.
+        candidate = self.controller.theta
+        update = update_without_fit(self._blocks, candidate_before, candidate)
+        step = update_without_fit(self._blocks, mean_before, self.theta).step
+        return update._replace(step=step)
 
+    def state_dict(self) -> State:
+        """All costs: with the seed they say what CMA-ES has drawn and learned."""
+        return {
+            "theta": self.theta,
+            "generations": np.array(self._generations),
+            "evaluated": np.array(self._evaluated),
+            "costs": np.array(self._costs),
+        }
 
-class PolicySearchSimulator(PolicySearch):
-    """`PolicySearch` on a plant that is put back: a generation's candidates meet one noise.
-
-    Each episode begins at the scenario's initial state.
-    """
-
-    asks_for = "simulator"
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned; CMA-ES is told the costs once more."""
+        self._generations = []
+        for costs in state["generations"].tolist():
+            self._tell(costs)
+        self.theta = state["theta"]
+        self._evaluated = state["evaluated"].tolist()
+        self._costs = state["costs"].tolist()

@@ -14,8 +14,9 @@ from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.protocols import Matrix, Vector
 from cosim.scenario import Penalty, Scenario
+from learning.checkpoint import State
 
-SLOWEST = 1000.0
+LONGEST_TIME_CONSTANT = 1000.0
 """Cap of the slowest time constant in samples; that of an integrating state is infinite."""
 
 
@@ -28,58 +29,108 @@ class OneStepModel:
 
     def __init__(self, scenario: Scenario) -> None:
         problem = Problem.from_scenario(scenario)
-        self.states, self.inputs = problem.n_states, problem.n_states + problem.n_actions
-        model = problem.model
-        step = discretise(model, problem.sampling_time, problem.substeps)
-        x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
-        d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
-        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": step(x, u, d, p)})
-        self._problem, self._model = problem, model
-        free = ca.SX.sym("p", len(model.parameters))
-        given = {"x": x, "u": u, "p": free}
-        self._parametric = StackedFunction("f", given, {"y": step(x, u, d, free)})
+        self._problem = problem
+        self._model = problem.model
+        self.n_states = problem.n_states
+        step = discretise(self._model, problem.sampling_time, problem.substeps)
+        x = ca.SX.sym("x", problem.n_states)
+        u = ca.SX.sym("u", problem.n_actions)
+        p = ca.SX.sym("p", len(self._model.parameters))
+        d = ca.DM(self._model.nominal_disturbance)
+        nominal = ca.DM(self._model.nominal_parameters)
+        # Two functions: that of the nominal parameters is called in every sample.
+        nominal_step = step(x, u, d, nominal)
+        self._nominal = StackedFunction("f", {"x": x, "u": u}, {"y": nominal_step})
+        parametric_step = step(x, u, d, p)
+        inputs = {"x": x, "u": u, "p": p}
+        self._parametric = StackedFunction("f", inputs, {"y": parametric_step})
 
     def __call__(self, s: Vector, a: Vector) -> Vector:
         """Prediction for state s (n,) and action a (m,)."""
-        function = self._function
-        function.inputs["x"][:], function.inputs["u"][:] = s, a
+        function = self._nominal
+        function.inputs["x"][:] = s
+        function.inputs["u"][:] = a
         function()
         return function.stack.copy()
 
     @cached_property
     def slowest(self) -> float:
-        """Samples of f's slowest time constant at the reference, `SLOWEST` at most."""
-        largest = np.abs(np.linalg.eigvals(linear_model(self._problem)[0])).max()
-        return float(1.0 / max(1.0 - largest, 1.0 / SLOWEST))
+        """Samples of f's slowest time constant at the reference, 1000 at most."""
+        # A continuous pole −1/T is a discrete one of 1 − 1/T samples, to first order.
+        A = linear_model(self._problem)[0]
+        largest = np.abs(np.linalg.eigvals(A)).max()
+        return float(1.0 / max(1.0 - largest, 1.0 / LONGEST_TIME_CONSTANT))
 
     def parameters(self, theta: Parameters) -> Vector:
         """All parameters of the model at θ, (n_p,): the nominal ones but for its block p."""
         values = self._model.nominal_parameters
         if "p" in theta.blocks:
-            values[self._model.parameter_indices(theta.blocks.block("p").labels)] = theta["p"]
+            labels = theta.blocks.block("p").labels
+            values[self._model.parameter_indices(labels)] = theta["p"]
         return values
 
-    def predict(self, states: Matrix, actions: Matrix, parameters: Vector) -> Matrix:
-        """f(s, a), (K, n), without offset, for K states and actions and one (n_p,) for all."""
-        states, actions = np.atleast_2d(states), np.atleast_2d(actions)
-        function, found = self._parametric, np.empty(states.shape)
+    def predict(
+        self,
+        states: Matrix,
+        actions: Matrix,
+        parameters: Vector,
+    ) -> Matrix:
+        """Predictions f(s, a) without offset.
+
+        Args:
+            states: s, (K, n).
+            actions: a, (K, m).
+            parameters: of the model, (n_p,), the same for all.
+
+        Returns:
+            s₊, (K, n).
+        """
+        states = np.atleast_2d(states)
+        actions = np.atleast_2d(actions)
+        predicted = np.empty(states.shape)
+        function = self._parametric
         function.inputs["p"][:] = parameters
-        for row, s, a in zip(found, states, actions, strict=True):
-            function.inputs["x"][:], function.inputs["u"][:] = s, a
+        # One call a sample, into the function's own memory: no allocation.
+        for row, s, a in zip(predicted, states, actions, strict=True):
+            function.inputs["x"][:] = s
+            function.inputs["u"][:] = a
             function()
             row[:] = function.stack
-        return found
+        return predicted
 
     def errors(
-        self, states: Matrix, actions: Matrix, next_states: Matrix, theta: Parameters
+        self,
+        states: Matrix,
+        actions: Matrix,
+        next_states: Matrix,
+        theta: Parameters,
     ) -> Matrix:
-        """s₊ − f_θ(s, a), (K, n), offset included."""
+        """Prediction errors s₊ − f_θ(s, a), offset included.
+
+        Args:
+            states: s, (K, n).
+            actions: a, (K, m).
+            next_states: s₊, (K, n).
+            theta: has the model's parameters and c_f.
+
+        Returns:
+            e, (K, n).
+        """
         predicted = self.predict(states, actions, self.parameters(theta)) + theta["c_f"]
         return np.atleast_2d(next_states) - predicted
 
 
 def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
-    """Penalty of many states (…, n), shape (…)."""
+    """Penalty of many states.
+
+    Args:
+        penalty: its weights and bounds.
+        states: (…, n).
+
+    Returns:
+        Penalties, (…).
+    """
+    # Linear and quadratic in the violation of each state.
     violation = penalty.violation(states)
     due = violation * (penalty.linear + penalty.quadratic * violation)
     return np.asarray(due.sum(axis=-1))
@@ -88,42 +139,75 @@ def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
 class SortedErrors:
     """Errors (M, n), of each state in ascending order, for means beyond a threshold."""
 
-    KEPT = ("errors", "_sum", "_squares")
-
     def __init__(self, errors: Matrix) -> None:
         self.errors = np.sort(errors, axis=0)
+        # Running sums, so that a mean beyond any threshold is two look-ups.
         zero = np.zeros((1, self.errors.shape[1]))
         self._sum = np.concatenate([zero, np.cumsum(self.errors, axis=0)])
-        self._squares = np.concatenate([zero, np.cumsum(self.errors**2, axis=0)])
+        self._sum_of_squares = np.concatenate([zero, np.cumsum(self.errors**2, axis=0)])
 
-    def beyond(self, i: int, threshold: Vector, *, above: bool = False) -> tuple[Vector, Vector]:
-        """Means of v and v² with v = max(t − e_i, 0), or max(e_i − t, 0), for each t of (K,)."""
-        count = np.searchsorted(self.errors[:, i], threshold)
-        number, first, second = count, self._sum[count, i], self._squares[count, i]
+    def beyond(
+        self,
+        i: int,
+        threshold: Vector,
+        *,
+        above: bool = False,
+    ) -> tuple[Vector, Vector]:
+        """Means of v and v² with v = max(t − e_i, 0), or max(e_i − t, 0).
+
+        Args:
+            i: the state.
+            threshold: t, (K,).
+            above: max(e_i − t, 0).
+
+        Returns:
+            Both means, (K,) each.
+        """
+        # Σ (t − e) = number·t − Σ e over the errors on this side of t; the square likewise.
+        below = np.searchsorted(self.errors[:, i], threshold)
+        number = below
+        total = self._sum[below, i]
+        squares = self._sum_of_squares[below, i]
+        sign = 1.0
         if above:
-            number = len(self.errors) - count
-            first, second = self._sum[-1, i] - first, self._squares[-1, i] - second
-        sign = -1.0 if above else 1.0
-        linear = sign * (number * threshold - first) / len(self.errors)
-        quadratic = (number * threshold**2 - 2.0 * threshold * first + second) / len(self.errors)
+            number = len(self.errors) - below
+            total = self._sum[-1, i] - total
+            squares = self._sum_of_squares[-1, i] - squares
+            sign = -1.0
+        linear = sign * (number * threshold - total) / len(self.errors)
+        sum_of_squares = number * threshold**2 - 2.0 * threshold * total + squares
+        quadratic = sum_of_squares / len(self.errors)
         return np.maximum(linear, 0.0), np.maximum(quadratic, 0.0)
 
 
 def expected_penalties(
-    penalty: Penalty, predictions: Matrix, errors: SortedErrors, scales: Matrix | None = None
+    penalty: Penalty,
+    predictions: Matrix,
+    errors: SortedErrors,
+    scales: Matrix | None = None,
 ) -> Matrix:
-    """Penalty of each state's lower and upper bound, (n, 2, K), a mean over f + h e of all errors.
+    """Expected penalty of each state's bounds, a mean over f + h e of all errors e.
 
-    `predictions` f and `scales` h are (K, n), h one if not given.
+    Args:
+        penalty: its weights and bounds.
+        predictions: f, (K, n).
+        errors: e.
+        scales: h, (K, n), one if not given.
+
+    Returns:
+        Penalties of the lower and the upper bound, (n, 2, K).
     """
     costs = np.zeros((predictions.shape[1], 2, len(predictions)))
     for i, predicted in enumerate(predictions.T):
         h = np.ones(len(predicted)) if scales is None else scales[:, i]
         for k, bound in enumerate((penalty.lower[i], penalty.upper[i])):
-            if np.isfinite(bound):
-                first, second = errors.beyond(i, (bound - predicted) / h, above=bool(k))
-                due = penalty.linear[i] * h * first + penalty.quadratic[i] * h**2 * second
-                costs[i, k] = due
+            if not np.isfinite(bound):
+                continue
+            # In units of h the errors are the same for all predictions.
+            first, second = errors.beyond(i, (bound - predicted) / h, above=bool(k))
+            linear = penalty.linear[i] * h * first
+            quadratic = penalty.quadratic[i] * h**2 * second
+            costs[i, k] = linear + quadratic
     return costs
 
 
@@ -133,8 +217,6 @@ class PredictionErrors:
     The realised penalty p(s₊) is a rare spike; its expectation mean_i p(f(s, a) + e_i) is smooth in
     s and a. It needs plant data alone, and the errors include those of the model.
     """
-
-    KEPT = ("_errors", "count")
 
     def __init__(self, scenario: Scenario, capacity: int) -> None:
         self._penalty = scenario.state_penalty
@@ -155,5 +237,16 @@ class PredictionErrors:
     def expected_penalty(self, prediction: Vector) -> float:
         """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""
         values = self.values
+        if not len(values):
+            return float("nan")
         due = known_penalty(self._penalty, prediction + values)
-        return float(due.mean()) if len(values) else float("nan")
+        return float(due.mean())
+
+    def state_dict(self) -> State:
+        """The errors, and how many there have been."""
+        return {"errors": self._errors, "count": self.count}
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        self._errors = state["errors"]
+        self.count = state["count"]

@@ -1,19 +1,23 @@
-"""Online Q-learning: θ steps as the transitions come, each with the present θ's Q and V."""
+"""Q-learning online: a temporal-difference step a sample, or a Kalman filter over θ with a prior.
+
+What it shares with Q-learning in batches is here too: hyperparameters, prior widths, mean cost.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from controllers.theta import Parameters
 from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
+from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import (
     Configuration,
     Count,
@@ -24,11 +28,9 @@ from learning.configuration import (
 )
 from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel, PredictionErrors
-from learning.step import ConstrainedStep, Fit, prior_deviation, td_fit, td_step
+from learning.step import ConstrainedStep, Fit, td_fit, td_step
 
 Values = TypeVar("Values", float, NDArray[np.float64])
-OUTLIER = 25.0
-"""Squares of innovations beyond this many variances count as this many."""
 
 
 class ValueConfiguration(Configuration):
@@ -44,24 +46,57 @@ class ValueConfiguration(Configuration):
         "time alters), and the scenario's for the rules td and fit",
     )
     prior_width: Positive = Field(
-        0.15, description="how far θ may be from its start, as a share of the start's cost"
+        0.15,
+        description="how far θ may be from its start, as a share of the start's cost",
+    )
+    level_width: Positive = Field(
+        0.16,
+        description="width of c_lambda as a share of V's level, which is all that it carries",
+    )
+    offset_width: Positive = Field(
+        0.02,
+        description="width of c_f in standard deviations of e: its mean is measured, the TD error "
+        "need not say it",
+    )
+    back_off_width: Positive = Field(
+        2.0,
+        description="width of x_l and x_u in standard deviations of e at a prior_width of 0.3; "
+        "in proportion to that",
+    )
+    slow_state_share: NonNegative = Field(
+        0.3,
+        description="a slow state moves by this share of its standard deviation where that is more "
+        "than e's",
+    )
+    gradient_share: NonNegative = Field(
+        0.3,
+        description="width of a cost gradient as a share of the start's, where that is more than "
+        "a shift's",
     )
     measure_offset: bool = Field(
         True,
         description="c_f becomes the mean of the first prediction errors; false: it starts as it "
-        "is, for a start that has learnt its offset",
+        "is, for a start that has learned its offset",
     )
     innovation_clip: Positive = Field(
-        3.0, description="innovations are cut at this many standard deviations"
+        3.0,
+        description="innovations are cut at this many standard deviations",
+    )
+    outlier: Positive = Field(
+        25.0,
+        description="squares of innovations beyond this many variances count as this many",
     )
     variance_memory: Positive = Field(
-        2000.0, description="samples over which the innovations' variance is taken"
+        2000.0,
+        description="samples over which the innovations' variance is taken",
     )
     prediction_errors: Count = Field(
-        1000, description="prediction errors over which the next penalty is expected"
+        1000,
+        description="prediction errors over which the next penalty is expected",
     )
     largest_step: NonNegative = Field(
-        1.0, description="prior deviations by which a step may move an entry of θ; 0: no limit"
+        1.0,
+        description="prior deviations by which a step may move an entry of θ; 0: no limit",
     )
 
     def criterion(self, scenario: Scenario) -> tuple[float, float]:
@@ -71,23 +106,22 @@ class ValueConfiguration(Configuration):
         """
         return self.discount or 1.0, 0.0
 
-    def narrowed(self, width: float) -> Self:
-        """Copy whose prior is `width` times as wide."""
-        return self.model_copy(update={"prior_width": width * self.prior_width})
-
 
 class QLearningConfiguration(ValueConfiguration):
     """Hyperparameters of online Q-learning."""
 
     rule: Literal["kalman", "td", "fit"] = Field(
-        "kalman", description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)"
+        "kalman",
+        description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
     )
     prior_samples: Count = Field(
-        500, description="first samples, at which θ rests: they give noise and widths"
+        500,
+        description="samples of the warm-up, in which θ stays: they give noise and widths",
     )
     step_every: Count = Field(50, description="samples per step of θ")
     variance_memory: Positive = Field(
-        200.0, description="samples over which the innovations' variance is taken"
+        200.0,
+        description="samples over which the innovations' variance is taken",
     )
     mean_cost_memory: NonNegative = Field(
         1.625,
@@ -101,7 +135,8 @@ class QLearningConfiguration(ValueConfiguration):
     )
     step_size: Positive = Field(1e-3, description="rules td and fit: α")
     scaled: bool = Field(
-        True, description="rules td and fit: step in coordinates θ/scale, else in θ itself"
+        True,
+        description="rules td and fit: step in coordinates θ/scale, else in θ itself",
     )
 
     def criterion(self, scenario: Scenario) -> tuple[float, float]:
@@ -112,48 +147,147 @@ class QLearningConfiguration(ValueConfiguration):
 
     def without_part(self) -> Mapping[str, str]:
         """Hyperparameters of other rules than the chosen one."""
-        if self.rule == "kalman":
-            names = ["step_size", "scaled"]
-        else:
-            names = ["prior_width", "prior_samples", "measure_offset", "step_every"]
-            names += ["innovation_clip", "variance_memory", "prediction_errors", "parameter_drift"]
-            names += ["mean_cost_memory", "largest_step"]
+        names = ["step_size", "scaled"]
+        if self.rule != "kalman":
+            names = [name for name in ValueConfiguration.model_fields if name != "discount"]
+            names += ["prior_samples", "step_every", "parameter_drift", "mean_cost_memory"]
+            for name in Configuration.model_fields:
+                names.remove(name)
         return dict.fromkeys(names, f"the rule {self.rule}")
+
+
+def prior_deviation(
+    start: Parameters,
+    state_deviation: Vector,
+    error_deviation: Vector,
+    action_deviation: Vector,
+    level: float,
+    settings: ValueConfiguration,
+) -> Vector:
+    """Standard deviation of each entry of θ about its start, without units of any plant.
+
+    With B a Hessian of the start, D = diag(B)^½ and κ = max_i B_ii σ_i² the cost of the most
+    expensive typical move, entries of B get w·D_i D_j and gradients w·D_i √κ, with w the
+    `prior_width` (docs/method.md).
+
+    Args:
+        start: θ at the start.
+        state_deviation: σ of s, (n,).
+        error_deviation: σ of the prediction errors e, (n,).
+        action_deviation: σ of the exploration, (m,).
+        level: size of c_lambda.
+        settings: the widths.
+
+    Returns:
+        The deviations, (n_θ,).
+    """
+    # What a typical move of each state and action costs sets the size of θ's entries.
+    width = settings.prior_width
+    state_move = np.maximum(state_deviation, error_deviation)
+    move = np.concatenate([state_move, action_deviation])
+    stage = _root_diagonal(start["B_l"])
+    terminal = _root_diagonal(start["B_Vf"])
+    arrival = np.sqrt(np.abs(np.diag(start["B_lambda"])))
+    initial = np.maximum(terminal, arrival)
+    root_of_largest_cost = float((stage * move).max())
+    slow = settings.slow_state_share * state_deviation
+    bound = settings.back_off_width * width / 0.3 * np.maximum(error_deviation, slow)
+    # A gradient may shift the minimum by as much as the most expensive typical move costs.
+    shift = terminal * root_of_largest_cost
+    share = settings.gradient_share
+    widths: dict[str, ArrayLike] = {
+        "B_lambda": width * np.outer(initial, initial),
+        "b_lambda": width * np.maximum(shift, np.abs(start["b_lambda"])),
+        "c_lambda": settings.level_width * abs(level),
+        "B_Vf": width * np.outer(terminal, terminal),
+        "b_Vf": width * np.maximum(shift, share * np.abs(start["b_Vf"])),
+        "B_l": width * np.outer(stage, stage),
+        "b_l": width * np.maximum(stage * root_of_largest_cost, share * np.abs(start["b_l"])),
+        "c_f": settings.offset_width * error_deviation,
+        "x_l": bound,
+        "x_u": bound,
+    }
+    # Weights and model parameters have a natural size: their own.
+    for name in ("w_sigma", "W_sigma", "p"):
+        if name in start.blocks:
+            widths[name] = width * np.abs(start[name])
+    packed = [block.pack(widths[block.name]) for block in start.blocks]
+    # An entry of no width would divide by zero where θ is scaled.
+    floor = np.finfo(np.float64).tiny ** 0.25
+    return np.maximum(np.concatenate(packed), floor)
+
+
+def _root_diagonal(matrix: NDArray[np.float64]) -> Vector:
+    root: Vector = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    return root
 
 
 class ValueRule(Algorithm):
     """Common part of online and batch Q-learning: prediction errors, a mean cost, coordinates."""
 
-    KEPT: ClassVar[tuple[str, ...]] = ("_step", "_average_cost", "_errors")
-
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
         self._errors = PredictionErrors(self.scenario, self.configuration.prediction_errors)
-        self._measure_in(np.ones(self.controller.theta.size))
+        self._set_coordinates(np.ones(self.controller.theta.size))
 
-    def _measure_in(self, scale: Vector) -> None:
+    def _set_coordinates(self, scale: Vector) -> None:
         """Begin anew with this scale of each entry of θ in the steps' coordinates, (n_θ,)."""
         self._step = ConstrainedStep(self.controller, self.configuration, scale)
-        discount, constants = self.configuration.criterion(self.scenario)
+        # A mean cost that follows δ must be slower than the loop.
+        discount, time_constants = self.configuration.criterion(self.scenario)
         position = self._step.blocks.slices["c_lambda"].start
-        level, cost = float(scale[position]), self.scenario.controller.reference_cost
-        memory = round(constants * self._model.slowest) if constants else 0
-        self._average_cost = AverageCost(discount, position, level, cost, memory)
+        memory = 0
+        if time_constants:
+            memory = round(time_constants * self._model.slowest)
+        self._average_cost = AverageCost(
+            discount=discount,
+            position=position,
+            scale=float(scale[position]),
+            start=self.scenario.controller.reference_cost,
+            memory=memory,
+        )
 
-    def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
+    def _begin_with_prior(
+        self,
+        states: Matrix,
+        errors: Matrix,
+        noise: float,
+    ) -> Parameters:
         """The prior's mean; its deviations become the coordinates.
 
-        `states` and `errors` e (K, n) are those of the first samples, `noise` is the standard
-        deviation of the TD errors, which c_lambda's level is not below.
+        Args:
+            states: s of the first samples, (K, n).
+            errors: their prediction errors e, (K, n).
+            noise: standard deviation of the TD errors, which c_lambda's level is not below.
         """
-        settings, start = self.configuration, self.controller.parameters
-        if settings.measure_offset:
+        start = self.controller.parameters
+        if self.configuration.measure_offset:
             start = start.replace({"c_f": errors.mean(axis=0)})
-        level, action = max(abs(float(start["c_lambda"])), noise), self.strategy.deviation
-        s, e = states.std(axis=0), errors.std(axis=0)
-        self._measure_in(prior_deviation(start, s, e, action, level, settings.prior_width))
+        deviation = prior_deviation(
+            start,
+            state_deviation=states.std(axis=0),
+            error_deviation=errors.std(axis=0),
+            action_deviation=self.strategy.deviation,
+            level=max(abs(float(start["c_lambda"])), noise),
+            settings=self.configuration,
+        )
+        self._set_coordinates(deviation)
         return start
+
+    def state_dict(self) -> State:
+        """Coordinates, mean cost and prediction errors."""
+        return {
+            **prefixed("step", self._step.state_dict()),
+            **prefixed("average_cost", self._average_cost.state_dict()),
+            **prefixed("errors", self._errors.state_dict()),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        self._step.load_state_dict(part_of(state, "step"))
+        self._average_cost.load_state_dict(part_of(state, "average_cost"))
+        self._errors.load_state_dict(part_of(state, "errors"))
 
 
 class QLearning(ValueRule):
@@ -161,82 +295,128 @@ class QLearning(ValueRule):
 
     `td` and `fit` step on each sample's δ = ℓ + γV_θ(s₊) − Q_θ(s, a) (paper.tex, eq. Qlearning).
 
-    `kalman` is an extended Kalman filter for Q with the target held and the next penalty in
-    expectation: θ ~ N(θ₀, diag(σ²)) with the widths of `learning.step`. One TD error measures ∇Qᵀd
-    with variance r (`KalmanRegression`):
+    `kalman` is an extended Kalman filter for Q with a fixed target and the next penalty in
+    expectation: θ ~ N(θ₀, diag(σ²)) with the widths of `prior_deviation`. One TD error measures
+    ∇Qᵀd with variance r (`KalmanRegression`):
 
         δ = ℓ + p(s) + γ[V_θ(s₊) − p(s₊) + mean_i p(f(s, a) + e_i)] − Q_θ(s, a)
 
     with f the controller's nominal model and e_i its latest prediction errors. Every `step_every`
-    samples θ moves by d under its constraints, in the metric P⁻¹. The first `prior_samples` move
-    only c_f, which becomes the mean of e (docs/method.md).
+    samples θ moves by d under its constraints, in the metric P⁻¹. The warm-up of `prior_samples`
+    moves only c_f, which becomes the mean of e (docs/method.md).
     """
 
     Configuration = QLearningConfiguration
-    KEPT = (*ValueRule.KEPT, "_first", "_regression", "_count", "_squares")
-    needs_action_value = True
+    needs_q_solution = True
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         settings = self.configuration
         if settings.rule != "kalman" and settings.scaled:
-            self._measure_in(self.controller.parameters.blocks.scale)
-        self._first: list[list[float]] = []  # rows (s, e, δ)
-        self._regression = self._filter(1.0)
+            self._set_coordinates(self.controller.parameters.blocks.scale)
+        self._warm_up: list[list[float]] = []  # rows (s, e, δ)
+        self._regression = self._new_regression(1.0)
         self._count = 0
-        self._squares = 0.0
+        self._sum_of_squares = 0.0  # of the innovations since the last step
 
     def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; every `step_every`-th moves θ, with `td` and `fit` each one does."""
+        """Learn from one sample; every `step_every`-th moves θ, with `td` and `fit` every one."""
         if self.configuration.rule != "kalman":
             return self._sample_step(transition)
+
         prediction = self._model(transition.s, transition.a)
         error = transition.next_s - prediction
+        # First the error, so that the expectation has at least one.
         self._errors.add(error)
+        # The realised penalty of s₊ is replaced by its expectation.
         expected = self._errors.expected_penalty(prediction)
-        value = transition.next_policy.value - transition.next_penalty + expected
-        solution = transition.action_value
-        td_error = self._average_cost.target(transition.cost, value) - solution.value
+        next_value = transition.next_solution.value - transition.next_penalty + expected
+        solution = transition.q_solution
+        target = self._average_cost.target(transition.cost, next_value)
+        td_error = target - solution.value
         self._average_cost.follow(td_error)
-        self._count += 1
-        if (left := self.configuration.prior_samples - self._count) >= 0:
-            self._first.append([*transition.s.tolist(), *error.tolist(), td_error])
-            return None if left else self._begin_filter()
-        gradient = self._average_cost.fitted(solution.value_gradient * self._step.scale)
-        innovation = self._regression.update(td_error, gradient)
-        self._squares += innovation * innovation
-        every = self.configuration.step_every
-        if self._count % every:
-            return None
-        error_size, self._squares = (self._squares / every) ** 0.5, 0.0
-        fit = self._regression.take()
-        return self._step.take(self._average_cost.take(fit), error_size)
 
-    def _begin_filter(self) -> Update:
-        """Take the noise, the widths and c_f from the first samples."""
-        first, n = np.array(self._first), self._model.states
-        self._first.clear()
-        variance = float(np.mean(first[:, -1] ** 2))
+        self._count += 1
+        # In the warm-up no θ moves: its samples say how large noise and errors are.
+        left = self.configuration.prior_samples - self._count
+        if left >= 0:
+            row = [*transition.s.tolist(), *error.tolist(), td_error]
+            self._warm_up.append(row)
+            return self._begin_regression() if left == 0 else None
+
+        # From here on each sample is a measurement of the step.
+        gradient = solution.value_gradient * self._step.scale
+        gradient = self._average_cost.without_level(gradient)
+        innovation = self._regression.update(td_error, gradient)
+        self._sum_of_squares += innovation * innovation
+        if self._count % self.configuration.step_every:
+            return None
+        mean_square = self._sum_of_squares / self.configuration.step_every
+        error_size = mean_square**0.5
+        self._sum_of_squares = 0.0
+        fit = self._average_cost.absorb(self._regression.step())
+        return self._step.apply(fit, error_size)
+
+    def _begin_regression(self) -> Update:
+        """Take the noise, the widths and c_f from the samples of the warm-up."""
+        rows = np.array(self._warm_up)
+        self._warm_up.clear()
+        n = self._model.n_states
+        # The start's TD errors are the noise that the filter expects.
+        td_errors = rows[:, -1]
+        variance = float(np.mean(td_errors**2))
         if not np.isfinite(variance):
             raise DivergenceError("TD errors are not finite")
-        start = self._begin(first[:, :n], first[:, n:-1], variance**0.5)
-        self._regression = self._filter(max(variance, np.finfo(np.float64).tiny))
+        start = self._begin_with_prior(rows[:, :n], rows[:, n:-1], variance**0.5)
+        self._regression = self._new_regression(max(variance, np.finfo(np.float64).tiny))
         return self._step.move(start.theta, variance**0.5)
 
-    def _filter(self, variance: float) -> KalmanRegression:
-        settings, largest = self.configuration, self.configuration.largest_step or np.inf
-        clip, memory = settings.innovation_clip, settings.variance_memory
-        drift = settings.parameter_drift
-        return KalmanRegression(self._step.scale.size, variance, clip, memory, drift, largest)
+    def _new_regression(self, variance: float) -> KalmanRegression:
+        settings = self.configuration
+        return KalmanRegression(
+            size=self._step.scale.size,
+            variance=variance,
+            clip=settings.innovation_clip,
+            memory=settings.variance_memory,
+            drift=settings.parameter_drift,
+            largest=settings.largest_step or np.inf,
+            outlier=settings.outlier,
+        )
 
     def _sample_step(self, transition: Transition) -> Update:
+        """A step on one sample, as the paper prints it."""
         settings = self.configuration
-        target = self._average_cost.target(transition.cost, transition.next_policy.value)
-        td_error = target - transition.action_value.value
-        gradient = transition.action_value.value_gradient * self._step.scale
+        solution = transition.q_solution
+        target = self._average_cost.target(transition.cost, transition.next_solution.value)
+        td_error = target - solution.value
+        gradient = solution.value_gradient * self._step.scale
         rule = td_fit if settings.rule == "fit" else td_step
-        fit = self._average_cost.take(rule(td_error, gradient, settings.step_size))
-        return self._step.take(fit, abs(td_error))
+        fit = rule(td_error, gradient, settings.step_size)
+        return self._step.apply(self._average_cost.absorb(fit), abs(td_error))
+
+    def begin_anew(self) -> None:
+        """Forget noise, widths and mean cost; the next samples are a warm-up at the present θ."""
+        self._count = 0
+        self._warm_up = []
+        self._average_cost.mean_cost = self.scenario.controller.reference_cost
+
+    def state_dict(self) -> State:
+        """What `ValueRule` keeps, the warm-up's rows, and the regression."""
+        return {
+            **super().state_dict(),
+            **prefixed("regression", self._regression.state_dict()),
+            "warm_up": np.array(self._warm_up),
+            "count": self._count,
+            "sum_of_squares": self._sum_of_squares,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        super().load_state_dict(state)
+        self._regression.load_state_dict(part_of(state, "regression"))
+        self._warm_up = state["warm_up"].tolist()
+        self._count = state["count"]
+        self._sum_of_squares = state["sum_of_squares"]
 
 
 @dataclass
@@ -245,41 +425,60 @@ class KalmanRegression:
 
         K = P∇Q/(r + ∇QᵀP∇Q),  d ← d + K·clip(δ − ∇Qᵀd),  P ← P − K∇QᵀP
 
-    Without clip and with r constant this is the ridge regression min Σ(δ−∇Qᵀd)²/r + ‖d‖². The
-    innovation is clipped at ±`clip`·√r; r follows its mean square with a memory of `memory`
-    samples. `drift` is added to P's diagonal at each sample. A step has no entry beyond ±`largest`.
+    Without clip and with r constant this is the ridge regression min Σ(δ−∇Qᵀd)²/r + ‖d‖².
+
+    Args:
+        size: entries of d.
+        variance: r at first; it follows the innovations' mean square.
+        clip: the innovation is clipped at ±clip·√r.
+        memory: samples over which r follows.
+        drift: added to P's diagonal at each sample.
+        largest: a step has no entry beyond ±largest.
+        outlier: squares of innovations beyond this many r count as this many.
     """
 
-    KEPT: ClassVar = ("mean", "covariance", "variance", "before")
     size: int
     variance: float
     clip: float
     memory: float
     drift: float = 0.0
     largest: float = np.inf
+    outlier: float = 25.0
 
     def __post_init__(self) -> None:
         self.mean: Vector = np.zeros(self.size)
         self.covariance: Matrix = np.eye(self.size)
-        self.before = self.covariance.copy()
+        self.covariance_at_step = self.covariance.copy()
         """P at the last step."""
 
     def update(self, td_error: float, gradient: Vector) -> float:
-        """Take δ and ∇Q (n,), scaled; returns the innovation δ − ∇Qᵀd."""
+        """Learn from one sample.
+
+        Args:
+            td_error: δ.
+            gradient: ∇Q, (n,), scaled.
+
+        Returns:
+            The innovation δ − ∇Qᵀd.
+        """
+        # The Kalman recursion for one scalar measurement.
         spread = self.covariance @ gradient
         scale = self.variance + float(gradient @ spread)
         innovation = td_error - float(gradient @ self.mean)
+        # A rare spike of the cost must not move θ as far as a hundred samples do.
         limit = self.clip * self.variance**0.5
         gain = spread / scale
         self.mean += gain * min(max(innovation, -limit), limit)
         self.covariance -= gain[:, None] * spread
         if self.drift:
-            self.covariance[np.diag_indices_from(self.covariance)] += self.drift
-        square = min(innovation * innovation, OUTLIER * self.variance)
+            diagonal = np.diag_indices_from(self.covariance)
+            self.covariance[diagonal] += self.drift
+        # The variance follows slowly, and an outlier counts as a bounded one.
+        square = min(innovation * innovation, self.outlier * self.variance)
         self.variance += (square - self.variance) / self.memory
         return innovation
 
-    def take(self) -> Fit:
+    def step(self) -> Fit:
         """The step d in the metric P⁻¹; d then starts from zero again.
 
         Of a step that is too long only a share is taken, and that share of P's decrease.
@@ -287,13 +486,32 @@ class KalmanRegression:
         longest = float(np.abs(self.mean).max())
         if longest > self.largest:
             share = self.largest / longest
+            decrease = self.covariance - self.covariance_at_step
             self.mean *= share
-            self.covariance = self.before + share * (self.covariance - self.before)
-        self.before = self.covariance.copy()
-        covariance = (self.covariance + self.covariance.T) / 2
-        information: Matrix = np.linalg.inv(covariance).astype(np.float64)
-        step, self.mean = self.mean, np.zeros_like(self.mean)
+            self.covariance = self.covariance_at_step + share * decrease
+        self.covariance_at_step = self.covariance.copy()
+        # Rounding makes P asymmetric over thousands of updates.
+        symmetric = (self.covariance + self.covariance.T) / 2
+        information: Matrix = np.linalg.inv(symmetric).astype(np.float64)
+        step = self.mean
+        self.mean = np.zeros_like(step)
         return Fit(information @ step, step, lambda: information)
+
+    def state_dict(self) -> State:
+        """Mean, covariances and variance."""
+        return {
+            "mean": self.mean,
+            "covariance": self.covariance,
+            "covariance_at_step": self.covariance_at_step,
+            "variance": self.variance,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        self.mean = state["mean"]
+        self.covariance = state["covariance"]
+        self.covariance_at_step = state["covariance_at_step"]
+        self.variance = state["variance"]
 
 
 class AverageCost:
@@ -301,18 +519,28 @@ class AverageCost:
 
     At γ = 1 the constant c_lambda cancels out of δ: its step goes to g, and c_lambda stays. With a
     `memory` g is no part of the fit, and each sample takes g ← g + δ/memory: differential
-    Q-learning after Wan, Naik and Sutton (2021). `position` and `scale` are those of c_lambda in
-    θ; `start` is the first guess of g.
+    Q-learning after Wan, Naik and Sutton (2021).
+
+    Args:
+        discount: γ.
+        position: of c_lambda in θ.
+        scale: of c_lambda in the fit's coordinates.
+        start: first guess of g.
+        memory: samples over which g follows δ; 0: g is fitted with θ.
     """
 
-    KEPT = ("mean_cost", "_scale")
-
     def __init__(
-        self, discount: float, position: int, scale: float, start: float, memory: int = 0
+        self,
+        discount: float,
+        position: int,
+        scale: float,
+        start: float,
+        memory: int = 0,
     ) -> None:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
-        self._position, self._scale = position, scale
+        self._position = position
+        self._scale = scale
         self._memory = memory if discount == 1.0 else 0
 
     def follow(self, td_error: float) -> None:
@@ -320,23 +548,38 @@ class AverageCost:
         if self._memory:
             self.mean_cost += td_error / self._memory
 
-    def fitted(self, gradient: Vector) -> Vector:
+    def without_level(self, gradient: Vector) -> Vector:
         """∇Q (n,) of the fitted entries: without c_lambda if g follows δ."""
         if not self._memory:
             return gradient
-        kept = gradient.copy()
-        kept[self._position] = 0.0
-        return kept
+        fitted = gradient.copy()
+        fitted[self._position] = 0.0
+        return fitted
 
     def target(self, cost: Values, next_value: Values) -> Values:
-        """Target of Q(s, a), of one sample or of several, (K,)."""
+        """Target of Q(s, a), of one sample or of several.
+
+        Args:
+            cost: ℓ plus the penalty of s, a number or (K,).
+            next_value: V(s₊), a number or (K,).
+        """
         return cost - self.mean_cost + self.discount * next_value
 
-    def take(self, fit: Fit) -> Fit:
+    def absorb(self, fit: Fit) -> Fit:
         """Move g by its part of a fit's step; returns the rest, which is for θ."""
         if self.discount != 1.0:
             return fit
+        # c_lambda stays, since it cancels out of δ at γ = 1.
         minimiser = fit.minimiser.copy()
         self.mean_cost += float(minimiser[self._position]) * self._scale
         minimiser[self._position] = 0.0
         return replace(fit, gradient=fit.metric() @ minimiser, minimiser=minimiser)
+
+    def state_dict(self) -> State:
+        """g and the scale of its entry."""
+        return {"mean_cost": self.mean_cost, "scale": self._scale}
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        self.mean_cost = state["mean_cost"]
+        self._scale = state["scale"]

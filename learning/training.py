@@ -1,15 +1,13 @@
-"""`train`: one training, from Python or the command line: settings, start, log and judge."""
+"""`train`: one training, from Python or the command line, with log, evaluations, checkpoints."""
 
 from __future__ import annotations
 
-import hashlib
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from functools import reduce
 from importlib.metadata import version
-from math import gcd, inf, isfinite, isnan
-from numbers import Integral, Real
+from math import inf, isfinite, isnan
 from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,339 +15,63 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from controllers import compile_functions
-from controllers.economic import tune
 from controllers.factories import nmpc
 from controllers.optimum import stored_optimum
-from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.theta import Parameters
 from cosim.errors import CapabilityError
 from cosim.files import check_target, staged, write_atomically
-from cosim.identity import depends_on
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
-from cosim.protocols import Array, Controller, Plant
-from cosim.result import Result, csv_text
+from cosim.protocols import Array
+from cosim.result import Result
 from cosim.scenario import Scenario
-from cosim.simulation import functions_of, indicators_of, reporting, simulate, spawn_seeds
-from cosim.statistics import gap_closed, regret, shown
-from cosim.validation import suggestion
+from cosim.simulation import functions_of, reporting, simulate
+from cosim.statistics import shown
 from learning import checkpoint
-from learning.algorithm import Algorithm, Privilege, Strategy, TrainingLoop, Update, load_algorithm
-from learning.commissioning import back_off, spare
+from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
+from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
+from learning.evaluator import HELD_OUT, Evaluator
+from learning.log import COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
+from learning.training_run import TrainingRun, begin, make_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SAMPLES = 50_000
-"""Length of a run where neither user nor algorithm states one."""
-STARTS = ("naive", "tuned", "commissioned", "cautious")
-FRAMES = 40
-"""Most frames of an animation."""
-SHOWN = {"J": "J", "greedy_J": "greedy J", "regret": "regret", "td_error": "TD"}
-"""Columns of the log behind the progress bar, with their text there."""
-EVERY = ("log_every", "evaluate_every", "checkpoint_every")
-LEAST = {"seed": 0} | dict.fromkeys(
-    ("samples", *EVERY, "evaluation_seeds", "evaluation_steps", "rest_after"), 1
-)
-
-
-@dataclass(frozen=True)
-class TrainingRun:
-    """The identity of a training run; only an identical one can resume a checkpoint.
-
-    The `configuration` is completed by what the `scenario` states. `controller`, `rti` or
-    `converged`, carries θ. A row of the log comes every `log_every` samples, a greedy evaluation of
-    θ every `evaluate_every`, on `evaluation_seeds` held-out seeds of `evaluation_steps` samples, a
-    checkpoint every `checkpoint_every`. After `rest_after` samples θ stays and nothing explores. A
-    run has diverged, and ends, where its greedy J exceeds the larger of the naive θ's and the
-    start's by more than (`divergence` − 1) of its magnitude, twice in a row or at the end. Raises
-    ConfigurationError on counts that make no run.
-    """
-
-    algorithm: str
-    scenario: Scenario
-    samples: int
-    seed: int
-    configuration: Configuration
-    controller: str = "rti"
-    log_every: int = 1000
-    evaluate_every: int = 5000
-    checkpoint_every: int = 5000
-    evaluation_seeds: int = 4
-    evaluation_steps: int = 500
-    divergence: float = 1.5
-    start: str = "naive"
-    rest_after: int | None = None
-
-    def __post_init__(self) -> None:
-        completed = self.configuration.for_scenario(self.scenario)
-        object.__setattr__(self, "configuration", completed)
-        for name, least in LEAST.items():
-            if (value := getattr(self, name)) is not None and value < least:
-                raise ConfigurationError(f"{name} must be at least {least}, not {value}")
-        if self.seed >= HELD_OUT:
-            raise ConfigurationError(
-                f"seed must be below {HELD_OUT}, not {self.seed}: the noise from there on is held "
-                "out, to evaluate what was learned"
-            )
-        for name in EVERY[1:]:
-            if getattr(self, name) % self.log_every:
-                raise ConfigurationError(
-                    f"{name} = {getattr(self, name)} must be a multiple of log_every = "
-                    f"{self.log_every}"
-                )
-
-    def identity(self) -> dict[str, Any]:
-        """The run as JSON-ready values, with the hashes of all code that its result depends on."""
-        values = {option.name: getattr(self, option.name) for option in fields(self)}
-        values["scenario"] = self.scenario.hash
-        values["configuration"] = self.configuration.model_dump(mode="json")
-        if (file := Path(self.start)).is_file():
-            values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-        values["source"] = depends_on(self.scenario, self.algorithm)
-        return values
-
-    def starting_parameters(self) -> Parameters:
-        """θ where the run starts; raises what the function `starting_parameters` raises."""
-        problem = Problem.from_scenario(self.scenario)
-        if self.start not in ("commissioned", "cautious"):
-            return starting_parameters(problem, self.configuration, self.start)
-        tuned = starting_parameters(problem, self.configuration, "tuned")
-        found = back_off(tuned, self.scenario)
-        return found if self.start == "commissioned" else spare(found, self.scenario)
-
-
-OPTIONS = {option.name for option in fields(TrainingRun)[3:]} - {"configuration"}
-"""Fields of `TrainingRun` that are options of `train` and of the command by their own names."""
-
-
-def prepare(
-    algorithm: str,
-    scenario: Scenario,
-    samples: int | None,
-    settings: Mapping[str, Any] | Configuration | None,
-    options: Mapping[str, Any],
-) -> TrainingRun:
-    """The run of an algorithm by name, checked; `options` are the other fields of `TrainingRun`.
-
-    Raises AlgorithmLookupError; ConfigurationError on settings or options that make no run.
-    """
-    found = load_algorithm(algorithm)
-    for name in options:
-        if name not in OPTIONS:
-            raise ConfigurationError(f"training has no option '{name}'{suggestion(name, OPTIONS)}")
-    _check_kinds({"samples": samples, **options})
-    if settings is not None and not isinstance(settings, Configuration | Mapping):
-        raise ConfigurationError(f"settings must be a table, not a {type(settings).__name__}")
-    if not isinstance(settings, Configuration):
-        settings = found.Configuration.from_dict(dict(settings or {}))
-    # Intervals that are not given are near their defaults and fit the others.
-    given = {name: value for name in EVERY if (value := options.get(name)) is not None}
-    together = gcd(*(given[name] for name in EVERY[1:] if name in given))
-    most = TrainingRun.log_every
-    log = given.get("log_every", next(k for k in range(most, 0, -1) if together % k == 0))
-    rows = max(1, round(TrainingRun.evaluate_every / max(1, log)))
-    return TrainingRun(
-        algorithm=algorithm,
-        scenario=scenario,
-        samples=getattr(found, "budget", SAMPLES) if samples is None else samples,
-        configuration=settings,
-        **{**options, **dict.fromkeys(EVERY[1:], rows * log), "log_every": log, **given},
-    )
-
-
-def _check_kinds(options: Mapping[str, Any]) -> None:
-    """Refuse options of another kind than the fields of `TrainingRun` by ConfigurationError."""
-    optional = {"samples", "rest_after", *EVERY}
-    for name, value in options.items():
-        if value is None and name in optional:
-            continue
-        kind: type = Integral if name in LEAST else Real if name == "divergence" else str
-        if not isinstance(value, kind) or isinstance(value, bool):
-            words = "a text" if kind is str else "a number" if kind is Real else "a whole number"
-            raise ConfigurationError(f"training: {name} must be {words}, not {value!r:.60}")
-    margin, carrier = options.get("divergence", 1.0), options.get("controller", "rti")
-    if not margin >= 1.0 or margin == inf:
-        raise ConfigurationError(f"training: divergence must be at least 1, not {margin}")
-    if carrier not in ("rti", "converged"):
-        raise ConfigurationError(
-            f"training: there is no controller '{carrier}'; there are rti and converged"
-        )
-
-
-def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> TrainingLoop:
-    """The loop of a run at its start: the plant is reset, once, and the first state is solved for.
-
-    All random numbers come from the run's seed.
-    """
-    controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
-    strategy = Strategy(run.configuration, run.scenario)
-    plant_seed, rng = spawn_seeds(run.seed)
-    # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
-    own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])
-    rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
-    loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
-    if (first := getattr(rule, "first_episode", None)) is not None:
-        plant, plant_seed = loop.simulator("first_episode"), first
-    loop.start(plant.reset(plant_seed))
-    return loop
-
-
-def starting_parameters(
-    problem: Problem, configuration: Configuration, start: str = "naive"
-) -> Parameters:
-    """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
-
-    `start` is `naive`, `tuned` or the path of a parameters file. `naive` and `tuned` take c_lambda
-    from the configuration; blocks that a file lacks start as with `naive`. Raises
-    ConfigurationError where the file has slack weights and the parametrisation none, ParameterError
-    on a bad file, TuningError where the tuning fails.
-    """
-    if not Path(start).exists() and (meant := suggestion(start, STARTS)) and start not in STARTS:
-        raise ConfigurationError(f"there is no start '{start}'{meant}, nor such a parameters file")
-    file = None if start in ("naive", "tuned") else Parameters.load(start, problem)
-    if file is not None and "w_sigma" in file.blocks and configuration.parametrisation == "paper":
-        raise ConfigurationError(
-            f"{start}: θ has slack weights, which the parametrisation 'paper' has not; set "
-            "parametrisation=extended"
-        )
-    learned = configuration.learned_parameters(problem.model)
-    given = file.blocks.block("p").labels if file is not None and "p" in file.blocks else ()
-    blocks = ThetaBlocks.of(
-        problem,
-        slack_weights=configuration.parametrisation == "extended",
-        model_parameters=(*given, *(name for name in learned if name not in given)),
-    )
-    # The level of V is that of the TD error's discount.
-    chosen: float | None = getattr(configuration, "discount", None)
-    discounted = configuration.value_offset == "discounted"
-    tuned = start == "tuned"
-    found = tune(problem, blocks).parameters if tuned else Parameters.naive(problem, blocks)
-    if discounted:
-        found = found.replace({"c_lambda": problem.value_level(chosen)})
-    names = [name for name in ("w_sigma", "W_sigma") if name in blocks]
-    found = found.replace({name: blocks.scale[blocks.slices[name]] for name in names})
-    return found if file is None else file.placed_in(found)
-
-
-CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
-LOG, PARAMETERS = "learning.csv", "parameters.toml"
+CHECKPOINT = "checkpoint.npz"
+FIGURE = "learning.png"
+LOG = "learning.csv"
+PARAMETERS = "parameters.toml"
 FILES = (
     CHECKPOINT, LOG, PARAMETERS, FIGURE, "learning.gif", "summary.json", "scenario.toml",
     "training.rrd",
 )  # fmt: skip
 """Files of a training; all in a folder belong to one run."""
-HELD_OUT = 1_000_000
-"""First of the held-out seeds; training seeds stay below."""
-FIGURES = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
-COLUMNS = (
-    "samples", "updates", "J", "td_error", "step", "smallest_eigenvalue", "corrected", "refused",
-    "failures", "explored", "saturated", "weakly_active", "licq_failed", "plant_samples",
-    "greedy_J", "greedy_economic_cost", "greedy_mean_violation", "greedy_violating_share",
-    "greedy_failures", "regret", "gap_closed",
-)  # fmt: skip
-
-
-class LogRow(dict[str, float]):
-    """A line of the log: figures by column, NaN where not measured, and the `parameters` then.
-
-    Only the CSV names the entries of θ.
-    """
-
-    __slots__ = ("parameters",)
-
-    def __init__(self, figures: Mapping[str, float], parameters: Parameters) -> None:
-        super().__init__(figures)
-        self.parameters = parameters
-
-
-def to_csv(rows: Sequence[LogRow]) -> str:
-    """The log as CSV: its figures, empty where not measured, and a column `theta NAME` an entry."""
-    if not rows:
-        return ""
-    labels = [f"theta {label}" for label in rows[0].parameters.blocks.labels]
-    return csv_text(
-        [*rows[0], *labels],
-        (map(_cell, [*row.values(), *row.parameters.theta.tolist()]) for row in rows),
-    )
-
-
-def _cell(value: float) -> str:
-    if isnan(value):
-        return ""
-    whole = isfinite(value) and value == int(value)  # the cost of a diverged run is infinite
-    return repr(int(value) if whole else value)
-
-
-def _total(values: Iterable[float]) -> float:
-    """The sum, in the order of the values: `sum` compensates for rounding in some versions."""
-    return reduce(add, values, 0.0)
-
-
-class Judge:
-    """Judges a run's θ by its greedy policy on the held-out seeds.
-
-    `start` is a θ of the run's blocks. J of the controller `optimum` on the same seeds is J*.
-    """
-
-    def __init__(
-        self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
-    ) -> None:
-        self._run, self._plant = run, plant
-        self._controller = nmpc(run.scenario, start, run.controller)
-        naive = Parameters.naive(Problem.from_scenario(run.scenario))
-        self._naive_cost = self._costs(nmpc(run.scenario, naive, run.controller))["J"]
-        self._optimal_cost = np.full(run.evaluation_seeds, np.nan)
-        self.start_J = float(self._costs(self._controller)["J"].mean())
-        """J of θ where the run starts."""
-        self.baselines = {"naive": float(self._naive_cost.mean())}
-        """J of naive and, where it is known, optimal."""
-        if optimum is not None:
-            self._optimal_cost = self._costs(optimum)["J"]
-            self.baselines["optimal"] = float(self._optimal_cost.mean())
-        # A cost may be negative (a profit): the margin is a share of its magnitude.
-        worst = max(self.baselines["naive"], self.start_J)
-        self.limit = worst + (run.divergence - 1) * abs(worst)
-        """Greedy J above which a run has diverged."""
-
-    def verdict(self, theta: Array) -> dict[str, Any]:
-        """The greedy policy at θ (n_θ,): means of `FIGURES`, `regret`, `gap_closed`.
-
-        `regret_interval` is its 95 % interval over the runs; `failures` is a sum; None is unknown.
-        """
-        self._controller.theta = theta
-        costs = self._costs(self._controller)
-        means: dict[str, Any] = {name: float(costs[name].mean()) for name in FIGURES}
-        beyond = regret(costs["J"], self._optimal_cost)
-        gap = gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value
-        known = isfinite(beyond.value)
-        return means | {
-            "failures": int(costs["failures"].sum()),
-            "regret": beyond.value if known else None,
-            "regret_interval": beyond.interval,
-            "gap_closed": gap if known else None,
-        }
-
-    def _costs(self, policy: Controller) -> dict[str, Array]:
-        """Indicators of a controller on the held-out seeds."""
-        seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
-        compile_functions(policy, self._run.evaluation_steps * len(seeds))
-        return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)
+REMARKS = {"J": "J", "greedy_J": "greedy J", "regret": "regret", "td_error": "TD"}
+"""Columns of the log behind the progress bar, with their text there."""
 
 
 @dataclass(frozen=True, repr=False)
 class Training(Result):
     """A training that has ended.
 
-    `parameters` are θ as the run hands it over, `rows` its log. `evaluation` is the greedy policy
-    on held-out noise (`Judge.verdict`), `start` the first θ and `start_J` its greedy J, `baselines`
-    J of `naive` and, where known, `optimal` on the same noise. `status` is `finished` or
-    `diverged: …`; `asks_for` the privilege of the algorithm. `functions` says whether the
-    controller's were `interpreted` or `compiled`; `without_checkpoint` why a checkpoint is missing.
+    Attributes:
+        run: what it was.
+        parameters: the final θ.
+        rows: its log.
+        evaluation: the greedy policy on held-out noise (`Evaluator.evaluate`).
+        status: `finished` or `diverged: …`.
+        requires: `operation` or `simulator`, as the algorithm says.
+        plant_samples: taken in all.
+        start: the first θ.
+        start_J: its greedy J.
+        baselines: J of `naive` and, where known, `optimal` on the same noise.
+        functions: whether the controller's were `interpreted` or `compiled`.
+        without_checkpoint: why a checkpoint is missing.
+        wall_seconds: the time that it took.
     """
 
     run: TrainingRun
@@ -357,7 +79,7 @@ class Training(Result):
     rows: list[LogRow]
     evaluation: dict[str, Any]
     status: str
-    asks_for: Privilege
+    requires: Privilege
     plant_samples: int
     start: Parameters
     start_J: float
@@ -393,8 +115,8 @@ class Training(Result):
     @property
     def regret(self) -> float:
         """(J − J*)/|J*| on that noise; NaN if J* is unknown."""
-        found = self.evaluation["regret"]
-        return float("nan") if found is None else float(found)
+        regret = self.evaluation["regret"]
+        return float("nan") if regret is None else float(regret)
 
     def controller(self) -> RtiNmpc:
         """A fresh controller that has this θ."""
@@ -402,46 +124,70 @@ class Training(Result):
 
     def log(self) -> dict[str, Array]:
         """The columns of the training's log, (K,) each, NaN where not measured."""
-        return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
+        columns = {}
+        for name in self.rows[0]:
+            columns[name] = np.array([row[name] for row in self.rows])
+        return columns
 
     def theta(self) -> dict[str, Array]:
         """Increments of θ since the start by block, (K, entries) each."""
         moved = np.array([row.parameters.theta - self.start.theta for row in self.rows])
-        return {name: moved[:, where] for name, where in self.parameters.blocks.slices.items()}
+        slices = self.parameters.blocks.slices
+        return {name: moved[:, where] for name, where in slices.items()}
 
     def figure(self) -> Figure:
         """Cost, violations, TD error and θ over the samples."""
         from cosim.figures.training import training_figure  # noqa: PLC0415 - matplotlib
 
-        blocks, run = self.parameters.blocks, self.run
-        scale = {name: blocks.scale[where] for name, where in blocks.slices.items()}
-        greedy, end = shown(self.J, digits=6), self.status.partition(":")[0]
+        run = self.run
+        blocks = self.parameters.blocks
+        # Each entry of θ in units of its own scale.
+        scaled = {}
+        for name, values in self.theta().items():
+            scaled[name] = values / blocks.scale[blocks.slices[name]]
+        end = self.status.partition(":")[0]
         return training_figure(
             self.log(),
-            {name: values / scale[name] for name, values in self.theta().items()},
+            scaled,
             self.baselines,
             start=self.start_J,
-            title=f"{run.algorithm} ({self.asks_for}) on {run.scenario.name} from "
-            f"{Path(run.start).stem}, seed {run.seed}: {end}, J = {greedy}",
+            title=f"{run.algorithm} ({self.requires}) on {run.scenario.name} from "
+            f"{Path(run.start).stem}, seed {run.seed}: {end}, J = {shown(self.J, digits=6)}",
         )
 
-    def animate(self, path: str | Path, steps: int = 200) -> Path:
-        """Write a GIF of the closed loop with θ as it was learnt, over that of the start.
+    def animate(
+        self,
+        path: str | Path,
+        steps: int = 200,
+        frames: int = 40,
+    ) -> Path:
+        """Write a GIF of the closed loop with θ as it was learned, over that of the start.
 
-        A frame for each of at most 40 rows of the log, on noise that no training met. Raises
-        FigureError, or OSError where the file cannot be written.
+        A frame for each of some rows of the log, on noise that no training met.
+
+        Args:
+            path: of the GIF.
+            steps: samples of a closed loop.
+            frames: at most.
+
+        Raises:
+            FigureError: nothing can be drawn.
+            OSError: the file cannot be written.
         """
         from cosim.figures.trajectory import animation  # noqa: PLC0415 - matplotlib
 
-        policy, runs = nmpc(self.run.scenario, self.start, self.run.controller), {}
-        seed = 2 * HELD_OUT + self.run.seed
-        with FmuPlant(self.run.scenario) as plant:
+        run = self.run
+        policy = nmpc(run.scenario, self.start, run.controller)
+        seed = 2 * HELD_OUT + run.seed
+        every = -(-len(self.rows) // frames)
+        runs = {}
+        with FmuPlant(run.scenario) as plant:
             first = simulate(plant, policy, steps, seed)
-            for row in self.rows[:: -(-len(self.rows) // FRAMES)]:
+            for row in self.rows[::every]:
                 policy.theta = row.parameters.theta
                 title = f"after {row['samples']:.0f} samples"
                 runs[title] = simulate(plant, policy, steps, seed)
-        return animation(Path(self.run.start).stem, first, self.run.algorithm, runs, path)
+        return animation(Path(run.start).stem, first, run.algorithm, runs, path)
 
     def save(self, folder: str | Path) -> Path:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""
@@ -457,13 +203,13 @@ class Training(Result):
         self.plot(folder / FIGURE)
 
     def summary(self) -> dict[str, Any]:
-        """The training as a JSON document: settings, the greedy policy's figures, how it ended."""
+        """The training as a JSON document: settings, the greedy policy's metrics, how it ended."""
         run = self.run
         last = self.rows[-1]
         return {
             "version": version("rti-cosim"),
             "algorithm": run.algorithm,
-            "asks_for": self.asks_for,
+            "requires": self.requires,
             "scenario": run.scenario.name,
             "scenario_hash": run.scenario.hash,
             "controller": run.controller,
@@ -479,9 +225,9 @@ class Training(Result):
             **self.evaluation,
             "smallest_eigenvalue": last["smallest_eigenvalue"],
             "td_error": last["td_error"],
-            "training_failures": last["failures"],
-            "weakly_active": last["weakly_active"],
-            "licq_failed": last["licq_failed"],
+            "training_failures": int(last["failures"]),
+            "weakly_active": int(last["weakly_active"]),
+            "licq_failed": int(last["licq_failed"]),
         }
 
 
@@ -489,13 +235,18 @@ class Tracker(Protocol):
     """An object that follows a training as `progress` of `train`; a function will do, too."""
 
     def start(self, run: TrainingRun) -> None:
-        """Take note of the run, before its first sample."""
+        """Note the run, before its first sample."""
 
     def __call__(self, samples: int, row: LogRow) -> None:
-        """Take a row of the log, at so many samples."""
+        """Note a row of the log.
+
+        Args:
+            samples: done so far.
+            row: the log's last one.
+        """
 
     def end(self, training: Training) -> None:
-        """Take the result, finished or diverged."""
+        """Note the result, finished or diverged."""
 
 
 def train(
@@ -522,7 +273,7 @@ def train(
 
     Raises AlgorithmLookupError, ConfigurationError, ScenarioError, PlantError, CheckpointError,
     each in one line, before the work where that is possible; PrivilegeError where an algorithm asks
-    more of the plant than it states. The arguments that are not below are `TrainingRun`'s fields.
+    more of the plant than it requires. The arguments that are not below are `TrainingRun`'s.
 
     Args:
         algorithm: a registered name (`learning.algorithm.algorithms`) or `module:Class`.
@@ -536,13 +287,33 @@ def train(
         progress: a function of the samples done and the log's last row, or a `Tracker`; True draws
             a bar.
     """
-    given = locals() | {"start": str(start)}
     if not isinstance(scenario, Scenario):
         scenario = Scenario.load(scenario)
-    options = {name: given[name] for name in OPTIONS}
-    run = prepare(algorithm, scenario, samples, settings, options)
+    run = make_run(
+        algorithm,
+        scenario,
+        samples,
+        settings,
+        seed=seed,
+        start=str(start),
+        controller=controller,
+        log_every=log_every,
+        evaluate_every=evaluate_every,
+        checkpoint_every=checkpoint_every,
+        evaluation_seeds=evaluation_seeds,
+        evaluation_steps=evaluation_steps,
+        divergence=divergence,
+        rest_after=rest_after,
+    )
+    # Regret needs J*, which is solved for once and stored.
     optimum = stored_optimum(scenario)
-    return run_training(run, out, resume=resume, optimum=optimum, progress=progress)
+    return run_training(
+        run,
+        out,
+        resume=resume,
+        optimum=optimum,
+        progress=progress,
+    )
 
 
 def run_training(
@@ -554,21 +325,31 @@ def run_training(
     progress: Callable[[int, LogRow], None] | bool = False,
     rule: type[Algorithm] | None = None,
 ) -> Training:
-    """Train as `run` says; the other arguments and the errors are those of `train`.
+    """Train as `run` says.
 
     With `out`, learning.csv, parameters.toml and checkpoint.npz are kept there during the run; a
     plant that cannot serialise its state leaves no checkpoint. Log, evaluations and files are of
-    the θ that the run would hand over then. Without an `optimum` regret and gap closed are unknown.
-    `rule` is the algorithm's class where it is not to be looked up by its name.
+    the final θ so far. Errors are those of `train`.
+
+    Args:
+        run: the run.
+        out: folder of its files; None keeps none.
+        resume: go on from the checkpoint in `out`.
+        optimum: controller whose J is J*; without it regret and gap closed are unknown.
+        progress: as in `train`.
+        rule: the algorithm's class where it is not to be looked up by its name.
     """
     clock = time.perf_counter()
-    getattr(progress, "start", lambda _: None)(run)
+    if hasattr(progress, "start"):
+        progress.start(run)
     best = build_controller(optimum, run.scenario) if optimum else None
     folder = None if out is None else Path(out)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+        # Before the work: a folder that cannot be written costs no run.
         for name in (LOG, PARAMETERS, CHECKPOINT):
             check_target(folder / name)
+    # Two plants: an evaluation must not touch the one that is learned from.
     with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
         session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
         compile_functions(session.loop.controller, run.samples)
@@ -576,26 +357,27 @@ def run_training(
             session.load()
         else:
             session.checkpoint()
-        judge = Judge(run, evaluation_plant, session.start, best)
-        with reporting(progress, run.algorithm, run.samples, _Remark()) as tell:
-            status = session.run_to_the_end(judge, tell)
+        evaluator = Evaluator(run, evaluation_plant, session.start, best)
+        with reporting(progress, run.algorithm, run.samples, _Remark()) as report:
+            status = session.run_to_the_end(evaluator, report)
         parameters = session.loop.parameters
         training = Training(
             run=run,
             parameters=parameters,
             rows=session.rows,
-            evaluation=judge.verdict(parameters.theta),
+            evaluation=evaluator.evaluate(parameters.theta),
             status=status,
-            asks_for=session.loop.algorithm.asks_for,
+            requires=session.loop.algorithm.requires,
             plant_samples=session.loop.counts.number,
             start=session.start,
-            start_J=judge.start_J,
-            baselines=judge.baselines,
+            start_J=evaluator.start_J,
+            baselines=evaluator.baselines,
             functions=functions_of(session.loop.controller),
             without_checkpoint=session.without_checkpoint,
             wall_seconds=time.perf_counter() - clock,
         )
-    getattr(progress, "end", lambda _: None)(training)
+    if hasattr(progress, "end"):
+        progress.end(training)
     return training
 
 
@@ -603,81 +385,113 @@ class _Remark(dict[str, float]):
     """The last value of each column of the log, and the remark behind a bar made of them."""
 
     def __call__(self, done: int, row: LogRow) -> tuple[int, str]:
-        self.update({name: value for name, value in row.items() if not isnan(value)})
-        return done, "  ".join(f"{SHOWN[name]} {self[name]:.4g}" for name in SHOWN if name in self)
+        for name, value in row.items():
+            if not isnan(value):
+                self[name] = value
+        words = []
+        for name, text in REMARKS.items():
+            if name in self:
+                words.append(f"{text} {self[name]:.4g}")
+        return done, "  ".join(words)
 
 
 class _Session:
     """A run in progress: its loop, its log so far, and its checkpoint."""
 
     def __init__(
-        self, run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant, out: Path | None
+        self,
+        run: TrainingRun,
+        algorithm: type[Algorithm],
+        plant: FmuPlant,
+        out: Path | None,
     ) -> None:
-        self.run, self.plant, self.out = run, plant, out
+        self.run = run
+        self.plant = plant
+        self.out = out
         self.identity = run.identity()
         self.loop = begin(run, algorithm, plant)
         self.start = self.loop.start_parameters
         self.rows: list[LogRow] = []
-        self.costs: list[float] = []  # and updates, since the last row
+        # Since the last row:
+        self.costs: list[float] = []
         self.updates: list[Update] = []
         self.without_checkpoint: str | None = None
 
-    def run_to_the_end(self, judge: Judge, progress: Callable[[int, LogRow], None]) -> str:
+    def run_to_the_end(self, evaluator: Evaluator, progress: Callable[[int, LogRow], None]) -> str:
         """Take all samples, with log, evaluations and checkpoints; `finished` or `diverged: …`."""
-        run, loop = self.run, self.loop
-        while (number := loop.counts.number) < run.samples:
+        run = self.run
+        number = self.loop.counts.number
+        while number < run.samples:
             try:
-                cost, update = loop.advance()
+                cost, update = self.loop.advance()
             except DivergenceError as error:
-                self.rows.append(self.row(number + 1, judge))
+                self.rows.append(self.row(number + 1, evaluator))
                 return f"diverged: {error} at sample {number + 1}"
             number += 1
             self.costs.append(cost)
-            self.updates += [] if update is None else [update]
-            if number % run.log_every and number < run.samples:
+            if update is not None:
+                self.updates.append(update)
+            # The last sample has a row, an evaluation and a checkpoint in any case.
+            last = number == run.samples
+            if number % run.log_every and not last:
                 continue
-            judged = number % run.evaluate_every == 0 or number == run.samples
-            row = self.row(number, judge if judged else None)
+            evaluated = last or number % run.evaluate_every == 0
+            row = self.row(number, evaluator if evaluated else None)
             self.rows.append(row)
-            if trouble := self.trouble(row, judge):
-                return trouble
-            if number % run.checkpoint_every == 0 or number == run.samples:
+            divergence = self.divergence(row, evaluator)
+            if divergence is not None:
+                return divergence
+            if last or number % run.checkpoint_every == 0:
                 self.checkpoint()
             progress(number, row)
         return "finished"
 
-    def row(self, number: int, judge: Judge | None) -> LogRow:
-        """A line of the log since the last one, with an evaluation by a judge."""
-        answer, counts = self.loop.parameters, asdict(self.loop.counts)
-        updates, count = self.updates, len(self.updates) or float("nan")
+    def row(self, number: int, evaluator: Evaluator | None) -> LogRow:
+        """A line of the log since the last one, with an evaluation where there is an evaluator."""
+        parameters = self.loop.parameters
+        updates = self.updates
+        # Of no update there is no mean.
+        n_updates = len(updates) or float("nan")
+        n_costs = len(self.costs) or float("nan")
+        mean_square = _total(update.td_error**2 for update in updates) / n_updates
         # Of all θ since the last row, whichever step gave it.
-        least = [inf, *(update.smallest_eigenvalue for update in updates)]
-        figures = dict.fromkeys(COLUMNS, float("nan")) | {
-            "samples": number,
-            "updates": len(updates),
-            "J": _total(self.costs) / (len(self.costs) or float("nan")),
-            "td_error": (_total(update.td_error**2 for update in updates) / count) ** 0.5,
-            "step": _total(update.step for update in updates) / count,
-            "smallest_eigenvalue": min(*least, smallest_eigenvalue(answer.blocks, answer.theta)),
-            "corrected": sum(update.corrected for update in updates),
-            "refused": sum(update.refused for update in updates),
-            "plant_samples": counts.pop("number"),
-        }
-        figures |= counts
-        self.costs, self.updates = [], []
-        if judge is not None:
-            verdict = judge.verdict(answer.theta)
-            figures |= {f"greedy_{name}": verdict[name] for name in FIGURES}
+        smallest = smallest_eigenvalue(parameters.blocks, parameters.theta)
+        for update in updates:
+            smallest = min(update.smallest_eigenvalue, smallest)
+        counts = asdict(self.loop.counts)
+        metrics = dict.fromkeys(COLUMNS, float("nan"))
+        metrics["samples"] = number
+        metrics["updates"] = len(updates)
+        metrics["J"] = _total(self.costs) / n_costs
+        metrics["td_error"] = mean_square**0.5
+        metrics["step"] = _total(update.step for update in updates) / n_updates
+        metrics["smallest_eigenvalue"] = smallest
+        metrics["corrected"] = sum(update.corrected for update in updates)
+        metrics["refused"] = sum(update.refused for update in updates)
+        metrics["plant_samples"] = counts.pop("number")
+        metrics |= counts
+        self.costs = []
+        self.updates = []
+        if evaluator is not None:
+            evaluation = evaluator.evaluate(parameters.theta)
+            for name in METRICS:
+                metrics[f"greedy_{name}"] = evaluation[name]
             for name in ("regret", "gap_closed"):
-                figures[name] = float("nan") if verdict[name] is None else verdict[name]
-        return LogRow(figures, answer)
+                known = evaluation[name] is not None
+                metrics[name] = evaluation[name] if known else float("nan")
+        return LogRow(metrics, parameters)
 
-    def trouble(self, row: LogRow, judge: Judge) -> str | None:
-        """Why the run must stop, or None: two evaluations in a row, or the last, are too dear."""
-        greedy, limit = row["greedy_J"], judge.limit
-        judged = [one["greedy_J"] for one in self.rows if isfinite(one["greedy_J"])]
-        once = len(judged) < 2 or judged[-2] <= limit
-        if not limit < greedy < inf or (once and row["samples"] < self.run.samples):
+    def divergence(self, row: LogRow, evaluator: Evaluator) -> str | None:
+        """Why the run must stop, or None: two evaluations in a row, or the last, are too high."""
+        greedy = row["greedy_J"]
+        limit = evaluator.limit
+        # Not NaN, where nothing was evaluated, nor infinite.
+        if not limit < greedy < inf:
+            return None
+        evaluations = [other["greedy_J"] for other in self.rows if isfinite(other["greedy_J"])]
+        # One bad evaluation may be noise, two are not.
+        once = len(evaluations) < 2 or evaluations[-2] <= limit
+        if once and row["samples"] < self.run.samples:
             return None
         reason = f"greedy J = {shown(greedy)} exceeds {shown(limit)}"
         return f"diverged: {reason} at sample {int(row['samples'])}"
@@ -697,32 +511,41 @@ class _Session:
         """Write what resuming needs, where the plant can say its state."""
         try:
             plant = self.plant.serialise(self.plant.snapshot())
-            state = self.loop.state()
         except CapabilityError as error:
             self.without_checkpoint = str(error)
             return
-        state |= {
-            "plant": np.frombuffer(plant, dtype=np.uint8),
-            "rows": [[*row.values()] for row in self.rows],
-            "row_thetas": np.array([row.parameters.theta for row in self.rows]),
-        }
+        # All that the rest of the run depends on, the log included.
+        state = prefixed("loop", self.loop.state_dict())
+        state["plant"] = np.frombuffer(plant, np.uint8)
+        state["rows"] = np.array([list(row.values()) for row in self.rows], float)
+        state["row_thetas"] = np.array([row.parameters.theta for row in self.rows])
         checkpoint.save(path, self.identity, state)
 
     def load(self) -> None:
         """Load the folder's checkpoint; raises CheckpointError if none fits."""
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
-        state = checkpoint.load(path := self.out / CHECKPOINT, self.identity)
+        path = self.out / CHECKPOINT
+        state = checkpoint.load(path, self.identity)
         try:
-            self.rows = [
-                LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
-                for figures, theta in zip(state["rows"], state["row_thetas"], strict=True)
-            ]
-            self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
-            self.loop.restore(state)
+            self._restore(state)
         except Exception as error:  # whatever arrays of other names, shapes or kinds lead to
-            said = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise CheckpointError(
-                f"{path}: the checkpoint does not hold the state of this run ({said}); begin anew "
-                "by --overwrite"
+                f"{path}: the checkpoint does not hold the state of this run ({reason}); begin "
+                "anew by --overwrite"
             ) from error
+
+    def _restore(self, state: State) -> None:
+        """Put log, plant and loop back as a checkpoint has them."""
+        self.rows = []
+        for values, theta in zip(state["rows"].tolist(), state["row_thetas"], strict=True):
+            metrics = dict(zip(COLUMNS, values, strict=True))
+            self.rows.append(LogRow(metrics, self.start.with_theta(theta)))
+        self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
+        self.loop.load_state_dict(part_of(state, "loop"))
+
+
+def _total(values: Iterable[float]) -> float:
+    """The sum, in the order of the values: `sum` compensates for rounding in some versions."""
+    return reduce(add, values, 0.0)

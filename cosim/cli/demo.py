@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -13,9 +13,8 @@ import cosim
 from cosim.cli import output as cli
 
 SCENARIO = "fouled"
-NAIVE, LEARNT, BACKED_OFF, OPTIMAL = "naive", "learnt", "tuned + back-off", "optimal"
+NAIVE, LEARNED, BACKED_OFF, OPTIMAL = "naive", "learned", "tuned + back-off", "optimal"
 BACKOFF_SAMPLES = 8000
-EVERY = ("log_every", "evaluate_every", "checkpoint_every")
 RUNS = 10
 """Runs of the comparison; the first is drawn and recorded."""
 
@@ -43,22 +42,31 @@ def demo(
         from cosim.figures.trajectory import overlay_figure
         from cosim.files import staged, temporary_folder
         from cosim.recording import record_overlay, record_training
-        from learning.training import HELD_OUT
+        from learning.evaluator import HELD_OUT
 
         scenario = cosim.Scenario.load(SCENARIO)
         folder = cli.open_folder(out)
         out_.note(scenario.description)
         trained = {}
-        for name, rule, start, number, settings in (
-            (BACKED_OFF, "backoff", "tuned", BACKOFF_SAMPLES, {}),
-            (LEARNT, "search", "naive", samples, {"rule": "q-learning"}),
+        for name, rule, start, number in (
+            (BACKED_OFF, "backoff", "tuned", BACKOFF_SAMPLES),
+            (LEARNED, "q-learning", "tuned", samples),
         ):
-            own: dict[str, Any] = {"settings": settings, "seed": seed, "start": start}
-            own |= dict.fromkeys(EVERY, max(1, number // 10))
-            trained[name] = cosim.train(rule, SCENARIO, number, progress=out_.live, **own)
+            every = max(1, number // 10)
+            trained[name] = cosim.train(
+                rule,
+                SCENARIO,
+                number,
+                seed=seed,
+                start=start,
+                log_every=every,
+                evaluate_every=every,
+                checkpoint_every=every,
+                progress=out_.live,
+            )
         first = 2 * HELD_OUT + seed  # noise that no training met
         with temporary_folder("cosim-demo-") as work, cosim.FmuPlant(scenario) as plant:
-            named = {NAIVE: NAIVE, BACKED_OFF: "", LEARNT: "", OPTIMAL: OPTIMAL}
+            named = {NAIVE: NAIVE, BACKED_OFF: "", LEARNED: "", OPTIMAL: OPTIMAL}
             for name, training in trained.items():
                 named[name] = str(training.parameters.save(work / f"{training.run.algorithm}.toml"))
             seeds = range(first, first + RUNS)
@@ -67,9 +75,9 @@ def demo(
                 name: cosim.simulate(
                     plant, cosim.build_controller(named[name], scenario), steps, first
                 )
-                for name in (NAIVE, LEARNT, OPTIMAL)
+                for name in (NAIVE, LEARNED, OPTIMAL)
             }
-        summary = found.summary() | {"training": trained[LEARNT].summary()}
+        summary = found.summary() | {"training": trained[LEARNED].summary()}
         signals = {
             name: RunSignals(name, run.signals, run.status, scenario.limits)
             for name, run in runs.items()
@@ -77,9 +85,9 @@ def demo(
         with staged(folder) as stage:
             found.write_files(stage)
             save(overlay_figure(runs), stage / "before-after.png")
-            trained[LEARNT].write_files(stage)
+            trained[LEARNED].write_files(stage)
             record_overlay(stage / "demo.rrd", signals, scenario.description)
-            record_training(stage / "training.rrd", trained[LEARNT])
+            record_training(stage / "training.rrd", trained[LEARNED])
             cli.write_summary(stage, summary)
         show(summary, out_)
         # `make demo` activates no environment.
@@ -87,7 +95,7 @@ def demo(
         out_.note(
             f"pictures   {folder / 'before-after.png'}, {folder / 'learning.png'}\n"
             f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}\n"
-            f"learnt θ   {folder / 'parameters.toml'} (a controller in every command)\n"
+            f"learned θ   {folder / 'parameters.toml'} (a controller in every command)\n"
             f"look at the recording with: {command} view {folder / 'demo.rrd'}"
         )
         out_.json(summary)

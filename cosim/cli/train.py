@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import cosim
 from cosim.cli import output as cli
 from cosim.errors import CosimError
+
+if TYPE_CHECKING:
+    from learning.configuration import Hyperparameter
 
 
 def train(
@@ -57,24 +61,35 @@ def train(
         evaluation_steps: Samples of each of them.
         divergence: Times the start's J at which a run has diverged.
         rest_after: Samples after which θ stays and nothing explores; default: never.
-        gif: Draw learning.gif too: the loop while θ is learnt.
+        gif: Draw learning.gif too: the loop while θ is learned.
     """
-    given = locals()
     with cli.output(json) as out_:
         from controllers.optimum import stored_optimum
         from cosim.files import staged
         from learning.algorithm import load_algorithm
-        from learning.training import CHECKPOINT, FILES, OPTIONS, prepare, run_training
+        from learning.training import CHECKPOINT, FILES, run_training
+        from learning.training_run import make_run
 
-        found = load_algorithm(algorithm)
+        rule = load_algorithm(algorithm)
         if explain:
-            rows = found.Configuration.documentation()
-            out_.table(f"hyperparameters of {algorithm}", ("name", "default", "meaning"), rows)
-            out_.json({name: {"default": given, "meaning": text} for name, given, text in rows})
+            _explain(algorithm, rule.Configuration.documentation(), out_)
             return
-        settings = found.Configuration.from_assignments(assignments or [])
-        options = {name: given[name] for name in OPTIONS}
-        run = prepare(algorithm, cosim.Scenario.load(scenario), samples, settings, options)
+        run = make_run(
+            algorithm,
+            cosim.Scenario.load(scenario),
+            samples,
+            rule.Configuration.from_assignments(assignments or []),
+            seed=seed,
+            start=start,
+            controller=controller,
+            log_every=log_every,
+            evaluate_every=evaluate_every,
+            checkpoint_every=checkpoint_every,
+            evaluation_seeds=evaluation_seeds,
+            evaluation_steps=evaluation_steps,
+            divergence=divergence,
+            rest_after=rest_after,
+        )
         folder = cli.open_folder(out)
         there = [name for name in FILES if (folder / name).exists()]
         if there and not (resume or overwrite):
@@ -112,11 +127,21 @@ def train(
         raise typer.Exit(1)
 
 
+def _explain(algorithm: str, hyperparameters: Sequence[Hyperparameter], output: cli.Output) -> None:
+    header = ("name", "default", "allowed", "meaning")
+    output.table(f"hyperparameters of {algorithm}", header, hyperparameters)
+    document = {}
+    for hyperparameter in hyperparameters:
+        words = hyperparameter._asdict()
+        document[words.pop("name")] = words
+    output.json(document)
+
+
 def _show(summary: dict[str, Any], output: cli.Output) -> None:
     from cosim.statistics import shown
 
     title = (
-        "{algorithm} ({asks_for}) on {scenario}, {samples} samples, seed {seed}: {status}"
+        "{algorithm} ({requires}) on {scenario}, {samples} samples, seed {seed}: {status}"
     ).format(**summary)
     rows = [
         ("greedy J on held-out noise", shown(summary["J"], digits=6)),

@@ -40,7 +40,7 @@ DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F", "tuned": "#E69F00", "converged": "#CC79A7", "optimal": "#111111",
     "q-learning": "#0072B2", "batch-q-learning": "#009E73", "actor-critic": "#D55E00",
-    "search": "#882255", "held": "#999933", "model-based": "#44AA99", "dyna": "#332288",
+    "held": "#999933", "model-based": "#44AA99", "dyna": "#332288",
     "offset-free": "#AA4499", "identified": "#117733", "policy-search": "#661100",
     "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9", "learnt": "#56B4E9",
 }  # fmt: skip
@@ -129,9 +129,9 @@ class LineStyle(NamedTuple):
 def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, LineStyle]:
     """A line style for each controller or case.
 
-    Cases of one rule, `rule(start=naive)`, `search+rule` and `rule-simulator`, share a colour and
-    differ in their line; so do `case-SCENARIO` of several scenarios. Known rules have colours of
-    their own, the same in all sets.
+    Cases of one rule, `rule` and `rule(start=naive)`, share a colour and differ in their line; so
+    do `case-SCENARIO` of several scenarios. Known rules have colours of their own, the same in all
+    sets.
 
     Args:
         names: of the cases, in the order of the figures.
@@ -155,11 +155,11 @@ def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Li
 
 def _rule(name: str, endings: Sequence[str]) -> str:
     """The rule that a case's name begins with: a known one's name, or all but its settings."""
-    head = name.partition("(")[0].removeprefix("search+")
+    head = name.partition("(")[0]
     for ending in endings:
         head = head.removesuffix(ending)
     known = [rule for rule in _KNOWN if f"{head}-".startswith(f"{rule}-")]
-    return max(known, key=len, default=head.removesuffix("-simulator"))
+    return max(known, key=len, default=head)
 
 
 def lighten(color: str) -> str:

@@ -24,7 +24,8 @@ from cosim.simulation import simulate
 from cosim.statistics import paired_difference, regrets, relative, shown
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
-from learning.training import LogRow, TrainingRun, begin
+from learning.log import LogRow
+from learning.training_run import TrainingRun, begin
 
 WINDOW = 100
 """Samples in a row of which the dearest are reported."""

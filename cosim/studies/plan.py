@@ -34,7 +34,8 @@ from cosim.validation import instead, validated
 from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training import HELD_OUT, prepare
+from learning.evaluator import HELD_OUT
+from learning.training_run import make_run
 
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"
@@ -43,6 +44,11 @@ ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
 MOST_SAMPLES = 100_000_000
 """Samples of the longest run."""
+TRAINING_OPTIONS = (
+    "log_every", "evaluate_every", "checkpoint_every", "evaluation_seeds", "evaluation_steps",
+    "divergence", "rest_after",
+)  # fmt: skip
+"""What a case's table `training` may say."""
 T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
 
@@ -283,9 +289,9 @@ class Study:
         curves, samples = self.held_out(scenario), case.samples
         if marks := self.marks(scenario):
             samples = marks[-1]
-            if (asked := load_algorithm(case.algorithm).asks_for) != "operation":
+            if (asked := load_algorithm(case.algorithm).requires) != "operation":
                 raise ConfigurationError(
-                    f"case '{case.name}': '{case.algorithm}' asks for a {asked}, and a study in "
+                    f"case '{case.name}': '{case.algorithm}' requires a {asked}, and a study in "
                     "operation has none"
                 )
         between = max(1, samples // self.table.curves.points)
@@ -294,6 +300,7 @@ class Study:
         own = {"seed": seed, "controller": case.nmpc, "start": self.located(case.start)}
         if twice := sorted(own.keys() & case.training):
             raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
+        _check_known(case.training, TRAINING_OPTIONS, "training", "option")
         options = {
             **own,
             "log_every": log_every,
@@ -359,7 +366,9 @@ def _read(study: Study, case: Case, name: str) -> _Content:
     scenario = study.scenarios[name]
     controller = ControllerSource.read(study.located(case.controller or case.start))
     if case.algorithm is not None:
-        prepare(scenario=scenario, **study.training(case, name, 0))
+        arguments = study.training(case, name, 0)
+        options = arguments.pop("options")
+        make_run(scenario=scenario, **arguments, **options)
     elif ":" in (case.controller or ""):
         controller.build(scenario)
     conditions = Conditions.of_now(scenario, case.target, files=study.depends_on)

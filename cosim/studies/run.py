@@ -34,7 +34,7 @@ from cosim.workers import Conditions, Failure, Item, done
 if TYPE_CHECKING:
     import pandas as pd
 
-    from learning.training import TrainingRun
+    from learning.training_run import TrainingRun
 
 RUNS, RUN, CHECKPOINT = "runs", "run.json", "checkpoint.npz"
 TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
@@ -93,7 +93,7 @@ def safe(name: str) -> str:
 class Training:
     """A training by its content.
 
-    `arguments` are those of `learning.training.prepare` but for the scenario; `start` is the text
+    `arguments` are those of `learning`'s `make_run` but for the scenario; `start` is the text
     of the θ file at the start, None for a start with a name. In operation θ is judged at `marks`.
     """
 
@@ -215,14 +215,15 @@ class TrainItem(Item[Trained]):
 
     def run(self) -> Trained:
         """Train, from the checkpoint if there is one."""
-        from learning.training import prepare  # noqa: PLC0415
+        from learning.training_run import make_run  # noqa: PLC0415
 
         arguments, begin = dict(self.training.arguments), time.perf_counter()
+        options = dict(arguments.pop("options"))
         with temporary_folder("cosim-training-") as own:
             if self.training.start is not None:
                 (own / "start.toml").write_text(self.training.start, "utf-8")
-                arguments["options"] = arguments["options"] | {"start": str(own / "start.toml")}
-            run = prepare(scenario=self.conditions.scenario, **arguments)
+                options["start"] = str(own / "start.toml")
+            run = make_run(scenario=self.conditions.scenario, **arguments, **options)
             trained = _in_operation if self.training.marks else _in_episodes
             log, parameters, about = trained(run, self.training.marks, self.folder or own)
         clock = about.pop("processor_seconds", {})
@@ -235,7 +236,7 @@ def _in_operation(
 ) -> tuple[str, str, dict[str, Any]]:
     """Log, θ and facts of a training from one plant sample to the next."""
     from cosim.studies import operation  # noqa: PLC0415
-    from learning.training import to_csv  # noqa: PLC0415
+    from learning.log import to_csv  # noqa: PLC0415
 
     rows, status, clock, taken = operation.live(run, marks)
     about = {"status": status, "samples": marks[-1], "plant_samples": taken}
@@ -246,7 +247,8 @@ def _in_episodes(
     run: TrainingRun, _: Sequence[int], folder: Path
 ) -> tuple[str, str, dict[str, Any]]:
     """Log, θ and facts of a training as `cosim train` does it, its checkpoint in a folder."""
-    from learning.training import COLUMNS, LogRow, run_training, to_csv  # noqa: PLC0415
+    from learning.log import COLUMNS, LogRow, to_csv  # noqa: PLC0415
+    from learning.training import run_training  # noqa: PLC0415
 
     result = run_training(run, folder, resume=(folder / CHECKPOINT).is_file())
     samples = int(result.rows[-1]["samples"]) if result.rows else 0

@@ -13,8 +13,8 @@ def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_pat
         assert code == 0, err
     summary = json.loads(out)
     rows = summary["controllers"]
-    assert set(rows) == {"naive", "tuned + back-off", "learnt", "optimal"}
-    assert rows["optimal"]["J"] < rows["learnt"]["J"] < rows["naive"]["J"]
+    assert set(rows) == {"naive", "tuned + back-off", "learned", "optimal"}
+    assert rows["optimal"]["J"] < rows["learned"]["J"] < rows["naive"]["J"]
     assert rows["naive"]["violating_share"] > 0.3
     assert summary["training"]["plant_samples"] == 4000
     names = {path.name for path in folders[0].iterdir()}

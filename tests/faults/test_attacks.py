@@ -124,7 +124,7 @@ def test_the_state_that_a_controller_reads_cannot_be_written(plant):
 @pytest.mark.parametrize("name", ["s", "a", "next_s"])
 def test_what_a_rule_observes_cannot_be_written(name):
     from learning.algorithm import load_algorithm
-    from learning.training import begin
+    from learning.training_run import begin
     from tests.helpers.training import make_run
 
     run = make_run(samples=20)

@@ -14,7 +14,7 @@ from cosim import Decision, FmuPlant, Scenario, Study, evaluate, simulate, train
 from cosim.errors import CosimError
 from cosim.evaluation import judge
 from learning import checkpoint
-from learning.training import prepare
+from learning.training_run import make_run
 from tests.helpers.loop import Proportional
 from tests.helpers.toy_study import case, document
 
@@ -71,8 +71,9 @@ def test_a_study_with_any_value_anywhere(path, value):
             study.noise(scenario)
             for one in study.cases:
                 if one.algorithm is not None:
-                    options = study.training(one, scenario, 0)
-                    prepare(scenario=study.scenarios[scenario], **options)
+                    arguments = study.training(one, scenario, 0)
+                    options = arguments.pop("options")
+                    make_run(scenario=study.scenarios[scenario], **arguments, **options)
 
     accepted(attempt)
 
@@ -107,7 +108,7 @@ OPTIONS = ("seed", "start", "controller", "log_every", "divergence", "settings",
 def test_a_training_with_any_option(name, value):
     options, settings_ = ({}, value) if name == "settings" else ({name: value}, None)
     options = {"seed": 0} | options
-    accepted(lambda: prepare("q-learning", PAPER, 10, settings_, options))
+    accepted(lambda: make_run("q-learning", PAPER, 10, settings_, **options))
 
 
 def test_a_training_seed_is_no_held_out_one():

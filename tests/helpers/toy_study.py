@@ -23,8 +23,8 @@ class Grow:
     """Moves the lower bounds of θ evenly; explores nothing."""
 
     Configuration: ClassVar = ToyConfiguration
-    asks_for: ClassVar = "operation"
-    needs_action_value = needs_points = explores = False
+    requires: ClassVar = "operation"
+    needs_q_solution = needs_points = explores = False
 
     def __init__(self, controller, scenario, configuration, samples, strategy, rng):
         self._controller, self._configuration = controller, configuration
@@ -36,10 +36,10 @@ class Grow:
             theta[where] += self._configuration.rate / 10
             self._controller.theta = theta
 
-    def state(self):
+    def state_dict(self):
         return {}
 
-    def restore(self, state):
+    def load_state_dict(self, state):
         pass
 
 

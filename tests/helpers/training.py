@@ -9,8 +9,11 @@ import pytest
 
 from controllers.rti import RtiNmpc
 from cosim import Scenario
-from learning.algorithm import Algorithm, Strategy, TrainingLoop, load_algorithm
-from learning.training import Training, TrainingRun, run_training
+from learning.algorithm import Algorithm, load_algorithm
+from learning.exploration import Strategy
+from learning.loop import TrainingLoop
+from learning.training import Training, run_training
+from learning.training_run import TrainingRun
 
 
 class Killed(BaseException):

@@ -14,7 +14,8 @@ from controllers import Parameters, Problem, RtiNmpc, functions
 from controllers.export import core, plain_c
 from cosim import FmuPlant, Scenario, simulate, train
 from cosim.simulation import spawn_seeds
-from learning.empirical_model import EmpiricalModel, Features, Rollout
+from learning.empirical_model import EmpiricalModel, Features
+from learning.rollout import Rollout
 from tests.helpers.compiler import needs_compiler
 
 SAMPLES, SEED = 70, 0
@@ -136,14 +137,14 @@ def test_a_training(scenario, problem):
 def fitted():
     """The evaporator's own model as an empirical one: the plant knows no limit."""
     features = Features(Problem.from_scenario(Scenario.load("paper")))
-    size = features.count + features.outputs * (1 + features.inputs)
+    size = features.n_parameters + features.n_outputs * (1 + features.n_inputs)
     return EmpiricalModel(
         features=features,
-        centre=np.zeros(features.inputs),
-        unit=np.ones(features.inputs),
+        centre=np.zeros(features.n_inputs),
+        unit=np.ones(features.n_inputs),
         mean=np.zeros(size),
         covariance=np.zeros((size, size)),
-        residuals=np.random.default_rng(1).uniform(-0.4, 0.4, (200, features.outputs)),
+        residuals=np.random.default_rng(1).uniform(-0.4, 0.4, (200, features.n_outputs)),
     )
 
 

@@ -6,7 +6,8 @@ import pytest
 from controllers.theta import Parameters
 from learning import ActorCritic
 from learning.actor_critic import lstdv, regression
-from learning.algorithm import Strategy, Transition
+from learning.algorithm import Transition
+from learning.exploration import Strategy
 from tests.helpers.training import Carrier
 
 

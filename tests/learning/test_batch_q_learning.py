@@ -8,8 +8,7 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import BatchQLearning, QLearning
 from learning.batch_q_learning import ReplayBuffer
-from learning.checkpoint import arrays_of, take_up
-from learning.training import TrainingRun, begin, starting_parameters
+from learning.training_run import TrainingRun, begin, starting_parameters
 from tests.helpers.training import looped
 
 
@@ -52,13 +51,13 @@ def test_replay_at_the_same_theta_gives_the_values_of_the_run(collected):
     controller, samples = collected
     buffer = filled(controller, samples)
     kept, action_value, next_value, gradient = buffer.replay()
-    q = [sample.action_value.value for sample in samples]
-    following = [sample.next_policy.value for sample in samples]
+    q = [sample.q_solution.value for sample in samples]
+    following = [sample.next_solution.value for sample in samples]
     assert kept.tolist() == [True] * 60
     assert action_value == pytest.approx(q, rel=1e-9)
     assert next_value == pytest.approx(following, rel=1e-9)
     assert gradient == pytest.approx(
-        np.array([s.action_value.value_gradient for s in samples]), rel=1e-6, abs=1e-6
+        np.array([s.q_solution.value_gradient for s in samples]), rel=1e-6, abs=1e-6
     )
     assert any(sample.explored for sample in samples)
 
@@ -152,6 +151,6 @@ def test_a_restored_buffer_remembers_what_was_solved(collected):
     first = buffer.replay()
     counting = Counting(controller)
     other = ReplayBuffer(counting, 100)
-    take_up(other, arrays_of(buffer))
+    other.load_state_dict(buffer.state_dict())
     assert_same(other.replay(), first)
     assert counting.feedbacks == 0

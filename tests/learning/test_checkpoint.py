@@ -1,10 +1,14 @@
-from dataclasses import dataclass, field
-from typing import ClassVar
-
 import numpy as np
 import pytest
 
-from learning.checkpoint import arrays_of, load, save, take_up
+from learning.checkpoint import (
+    generator_state,
+    load,
+    part_of,
+    prefixed,
+    save,
+    set_generator_state,
+)
 from learning.errors import CheckpointError
 
 RUN = {"algorithm": "actor-critic", "seed": 3, "deviation": (5.0,)}
@@ -13,7 +17,14 @@ RUN = {"algorithm": "actor-critic", "seed": 3, "deviation": (5.0,)}
 @pytest.fixture
 def stored(tmp_path):
     path = tmp_path / "checkpoint.npz"
-    return save(path, RUN, {"theta": np.linspace(0, 1, 5)})
+    return save(path, RUN, {"theta": np.linspace(0, 1, 5), "count": 3, "mean": 0.1, "began": True})
+
+
+def test_arrays_and_numbers_come_back_as_they_were(stored):
+    state = load(stored, RUN)
+    assert state["theta"].tolist() == np.linspace(0, 1, 5).tolist()
+    assert (state["count"], state["mean"], state["began"]) == (3, 0.1, True)
+    assert [type(state[name]) for name in ("count", "mean", "began")] == [int, float, bool]
 
 
 def test_another_runs_checkpoint_is_refused_by_the_field_that_differs(stored):
@@ -21,34 +32,23 @@ def test_another_runs_checkpoint_is_refused_by_the_field_that_differs(stored):
         load(stored, {**RUN, "seed": 4})
 
 
-@dataclass
-class Memory:
-    KEPT: ClassVar = ("number", "mean", "began", "weights")
-    number: int = 0
-    mean: float = 0.0
-    began: bool = False
-    weights: np.ndarray = field(default_factory=lambda: np.zeros(3))
+@pytest.mark.parametrize("value", ["a text", None])
+def test_what_is_no_array_nor_number_is_refused_by_its_name(tmp_path, value):
+    with pytest.raises(CheckpointError, match="mine"):
+        save(tmp_path / "checkpoint.npz", RUN, {"mine": value})
 
 
-class Kept:
-    KEPT = ("memory", "table", "rows", "nothing")
-
-    def __init__(self):
-        self.memory, self.table, self.rows, self.nothing = Memory(), {}, [], None
+def test_a_part_is_under_its_name():
+    state = prefixed("filter", {"mean": 1.0, "noise.variance": 2.0}) | {"filtered": 3.0}
+    assert part_of(state, "filter") == {"mean": 1.0, "noise.variance": 2.0}
 
 
-def test_what_is_kept_goes_through_arrays_with_the_types_that_it_had():
-    first, found = Kept(), Kept()
-    first.memory = Memory(3, 0.1, True, np.arange(4.0))
-    first.table, first.rows = {"a b": np.ones(2)}, [np.zeros(2), np.ones(2)]
-    take_up(found, arrays_of(first))
-    memory = found.memory
-    assert (memory.number, memory.mean, memory.began) == (3, 0.1, True)
-    assert (type(memory.number), type(memory.began)) == (int, bool)
-    assert memory.weights.tolist() == [0.0, 1.0, 2.0, 3.0]
-    assert found.table["a b"].tolist() == [1.0, 1.0] and found.nothing is None
-    assert [row.tolist() for row in found.rows] == [[0.0, 0.0], [1.0, 1.0]]
-    take_up(found, arrays_of(Kept()))
-    assert found.rows == [] and found.table == {}
-    with pytest.raises(KeyError):
-        take_up(found, {})
+def test_a_generator_goes_on_where_it_was():
+    rng, other = np.random.default_rng(3), np.random.default_rng(4)
+    rng.integers(10, dtype=np.int32)  # leaves half of a word
+    set_generator_state(other, generator_state(rng))
+    assert (
+        other.integers(2**31, size=5, dtype=np.int32).tolist()
+        == rng.integers(2**31, size=5, dtype=np.int32).tolist()
+    )
+    assert other.standard_normal(3).tolist() == rng.standard_normal(3).tolist()

@@ -4,19 +4,30 @@ import numpy as np
 import pytest
 
 from learning import ActorCritic, BatchQLearning, QLearning
-from learning.algorithm import Strategy, load_algorithm
+from learning.algorithm import load_algorithm
+from learning.back_off import BackOff
 from learning.configuration import Configuration
+from learning.dyna import Dyna
 from learning.errors import ConfigurationError
-from learning.search import Search
+from learning.exploration import Strategy
+from learning.model_based import ModelBased
 
-CLASSES = (QLearning, BatchQLearning, ActorCritic, Search)
+CLASSES = (QLearning, BatchQLearning, ActorCritic, ModelBased, BackOff, Dyna)
 
 
 @pytest.mark.parametrize("cls", CLASSES)
 def test_every_hyperparameter_is_documented_and_has_a_default(cls):
-    for name, default, meaning in cls.Configuration.documentation():
-        assert meaning, name
-        assert "Undefined" not in default, name
+    for hyperparameter in cls.Configuration.documentation():
+        assert hyperparameter.meaning and hyperparameter.allowed, hyperparameter.name
+        assert "Undefined" not in hyperparameter.default, hyperparameter.name
+
+
+def test_what_a_hyperparameter_may_be_is_said_in_words():
+    documented = {entry.name: entry.allowed for entry in Dyna.Configuration.documentation()}
+    assert documented["rule"] == "kalman, td, fit"
+    assert documented["prior_width"] == "number > 0"
+    assert documented["discount"] == "number > 0, ≤ 1 or nothing"
+    assert documented["change_windows"] == "4 × integer ≥ 1"
 
 
 def test_assignments_are_read_as_toml_and_bare_words_as_text():
@@ -37,7 +48,6 @@ def test_assignments_are_read_as_toml_and_bare_words_as_text():
         ("q-learning", "step_every=many", "step_every"),
         ("q-learning", "step_size=0.1", "step_size: has no part in the rule kalman"),
         ("batch-q-learning", "parameter_drift=0.1", "parameter_drift: unknown field"),
-        ("search", "phase=100", "phase: has no part in a search without a rule"),
         ("backoff", "exploration_share=0.1", "exploration_share: has no part in a rule that tries"),
     ],
 )

@@ -6,17 +6,19 @@ import numpy as np
 
 from controllers.problem import Problem
 from learning.dyna import ModelPlant
-from learning.empirical_model import EmpiricalModel, Features
-from learning.training import run_training, to_csv
+from learning.empirical_model import Features
+from learning.log import to_csv
+from learning.training import run_training
+from tests.helpers.empirical import fit
 from tests.helpers.training import killed_and_resumed, make_run
 
 
 def test_the_model_plays_the_plant_that_it_was_fitted_to(scenario, rng):
     features = Features(Problem.from_scenario(scenario))
     inputs = rng.normal([27.0, 60.0, 220.0, 230.0], [2.0, 6.0, 20.0, 20.0], (500, 4))
-    y, _, h = features(inputs, np.zeros(features.count))
+    y, _, h = features(inputs, np.zeros(features.n_parameters))
     noise = rng.uniform(-0.1, 0.1, y.shape)
-    model = EmpiricalModel.fit(features, inputs, 1.02 * y + h * noise)
+    model = fit(features, inputs, 1.02 * y + h * noise)
     plant = ModelPlant(scenario, model, np.array([24.0, 60.0]), rng)
     a, states, errors = np.array([220.0, 230.0]), [np.array([24.0, 60.0])], []
     for _ in range(400):
@@ -36,7 +38,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path):
     every = {"samples": 60, "log_every": 20, "evaluate_every": 60, "checkpoint_every": 20}
     run = make_run("learning.dyna:Dyna", scenario, settings, start="tuned", **every)
     whole = run_training(run)
-    assert whole.asks_for == "operation"
+    assert whole.requires == "operation"
     assert not np.array_equal(whole.parameters.theta, run.starting_parameters().theta)
     resumed = killed_and_resumed(run, tmp_path, 40)
     assert to_csv(resumed.rows) == to_csv(whole.rows)

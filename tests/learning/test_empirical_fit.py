@@ -6,18 +6,14 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from learning.empirical_model import EmpiricalModel, Features, PlantData
+from learning.plant_data import PlantData
+from tests.helpers.empirical import SETTINGS, fit
 
 PARAMETERS = 0.15
 """Prior standard deviation of a parameter's relative error."""
 SLOPES = (0.1, 0.01, 0.001)
 """Those of the slopes of W, in standard deviations of the error over one of the input."""
 CENTRE, WIDTH = [27.0, 60.0, 220.0, 230.0], [2.0, 6.0, 20.0, 20.0]
-
-
-@pytest.fixture(scope="module")
-def features(problem):
-    return Features(problem)
 
 
 def plant_data(features, rng, count, error):
@@ -37,7 +33,7 @@ class PlainEstimate:
     def __init__(self, features, inputs, outputs, slopes):
         z = (inputs - inputs.mean(axis=0)) / inputs.std(axis=0)
         z = np.column_stack([np.ones(len(z)), z])
-        p, K = features.count, features.outputs
+        p, K = features.n_parameters, features.n_outputs
         deviation = (outputs - features(inputs, np.zeros(p))[0]).std(axis=0)
         widths = [[own] + [own * slopes] * inputs.shape[1] for own in deviation]
         prior = np.concatenate([np.full(p, PARAMETERS), np.ravel(widths)])
@@ -63,10 +59,10 @@ class PlainEstimate:
 
 
 def test_the_estimate_is_that_of_plain_generalised_least_squares(features, rng):
-    error = rng.normal(scale=0.05, size=features.count)
+    error = rng.normal(scale=0.05, size=features.n_parameters)
     inputs, outputs = plant_data(features, rng, 200, error)
     outputs[:, 0] += 0.02 * (inputs[:, 0] - 27.0)
-    model = EmpiricalModel.fit(features, inputs, outputs)
+    model = fit(features, inputs, outputs)
     plain = max(
         (PlainEstimate(features, inputs, outputs, slopes) for slopes in SLOPES),
         key=lambda estimate: estimate.evidence,
@@ -94,8 +90,8 @@ def test_a_change_is_seen_where_hotellings_p_says_so_with_the_models_own_uncerta
 
     T² = ē' (Σ/15 + D C D')⁻¹ ē with the coefficients' covariance C: p = P(F(K, M−K) > …).
     """
-    data = PlantData(features, 2000)
-    for row in zip(*plant_data(features, rng, count, np.zeros(features.count)), strict=True):
+    data = PlantData(features, SETTINGS)
+    for row in zip(*plant_data(features, rng, count, np.zeros(features.n_parameters)), strict=True):
         data.add(sample(*row))
     model = data.fit()
     M, K = model.residuals.shape
@@ -114,25 +110,25 @@ def test_a_change_is_seen_where_hotellings_p_says_so_with_the_models_own_uncerta
     t2 = errors_of(1e-6) @ np.linalg.solve(certain, errors_of(1e-6))
     blind = stats.f.sf(t2 * (M - K) / (K * (M - 1)), K, M - K)
     assert blind < 1e-8, "without the model's uncertainty the alarm would be raised"
-    began = data.count
+    regime_start = data.count
     for row in zip(away, predicted + h * errors_of(1e-6), strict=True):
         data.add(sample(*row))
-    _, _, errors, designs = data.errors()
-    assert not data.changed(errors, designs)
-    assert data.changed(errors, designs, [15]), "where the samples are dearer too, 1e-4 is enough"
-    assert data.era == began
-    data.era = 0
+    predictions = data.predictions()
+    assert not data.changed(predictions)
+    assert data.changed(predictions, [15]), "where the samples are dearer too, 1e-4 is enough"
+    assert data.regime_start == regime_start
+    data.regime_start = 0
     more = errors_of(1e-8) - errors_of(1e-6)
-    assert data.changed(errors + more, designs)
-    assert data.era == began
+    assert data.changed(predictions._replace(errors=predictions.errors + more))
+    assert data.regime_start == regime_start
 
 
 def test_there_is_no_false_alarm_where_a_plant_is_met_elsewhere_than_before(features):
     """Twenty fits to few samples of a plant that stays: each alarm has a probability of 1e-7."""
     rng, alarms = np.random.default_rng(5), 0
     for _ in range(20):
-        error = rng.normal(scale=0.1, size=features.count)
-        data = PlantData(features, 500)
+        error = rng.normal(scale=0.1, size=features.n_parameters)
+        data = PlantData(features, SETTINGS)
         for row in zip(*plant_data(features, rng, 40, error), strict=True):
             data.add(sample(*row))
         data.fit()
@@ -141,6 +137,5 @@ def test_there_is_no_false_alarm_where_a_plant_is_met_elsewhere_than_before(feat
         y, _, h = features(inputs, error)
         for row in zip(inputs, y + h * rng.normal(0.0, 0.1, y.shape), strict=True):
             data.add(sample(*row))
-        _, _, errors, designs = data.errors()
-        alarms += data.changed(errors, designs)
+        alarms += data.changed(data.predictions())
     assert alarms == 0

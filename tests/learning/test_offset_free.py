@@ -1,14 +1,64 @@
-"""Offset-free control and back-off by prediction errors, from transitions made by hand."""
-
-from types import SimpleNamespace
+"""Offset-free control: its runs, and its back-off by prediction errors made by hand."""
 
 import numpy as np
 import pytest
 
-from learning.algorithm import Transition, load_algorithm
+from controllers.problem import Problem
+from controllers.rti import RtiNmpc
+from controllers.theta import Parameters
+from cosim import FmuPlant, simulate
+from learning.algorithm import Transition
+from learning.log import to_csv
+from learning.offset_free import OffsetFree
 from learning.prediction_errors import OneStepModel
+from learning.training import run_training
+from learning.training_run import begin
+from tests.helpers import training
+from tests.helpers.training import Carrier, killed_and_resumed
 
 MEMORY = 40
+
+
+def make_run(scenario="paper", settings=None, **changes):
+    values = {"samples": 450, "seed": 3, "start": "tuned", "evaluation_steps": 20}
+    every = {"log_every": 50, "evaluate_every": 450, "checkpoint_every": 50}
+    settings = settings or {"memory": 100}
+    return training.make_run("offset-free", scenario, settings, **{**values, **every, **changes})
+
+
+def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
+    run = make_run()
+    whole = run_training(run)
+    resumed = killed_and_resumed(run, tmp_path, 250)
+    assert to_csv(resumed.rows) == to_csv(whole.rows)
+    assert (whole.plant_samples, whole.status) == (450, "finished")
+
+
+def test_it_predicts_without_bias_under_a_wrong_model():
+    run = make_run("fouled", {"back_off": False}, samples=600)
+    theta = run_training(run).parameters
+    problem = Problem.from_scenario(run.scenario)
+    assert np.array_equal(theta["x_l"], problem.state_lower), "no back-off was asked for"
+    with FmuPlant(run.scenario) as plant:
+        seen = simulate(plant, RtiNmpc(problem, theta), 300, 11)
+    model, naive = OneStepModel(run.scenario), Parameters.naive(problem)
+    parts = seen.states[:-1], seen.actions[:-1], seen.states[1:]
+    before, after = (model.errors(*parts, other).mean(axis=0) for other in (naive, theta))
+    assert abs(after[1]) < 0.1 * abs(before[1])
+
+
+def test_it_goes_on_and_backs_off_by_its_own_errors():
+    run = make_run("fouled", samples=1400)
+    with FmuPlant(run.scenario) as plant:
+        loop, moved, bounds = begin(run, OffsetFree, plant), [], []
+        for sample in range(1400):
+            if loop.advance()[1] is not None:
+                moved.append(sample)
+                bounds.append([loop.parameters["x_l"][0], loop.parameters["x_u"][1]])
+    lower, upper = np.array(bounds).T
+    assert moved[-1] == 1399 and len(moved) == 140
+    assert (lower > 25.5).sum() > len(lower) / 2 and (upper < 80.0).any()
+    assert (lower >= 25.0).all() and (upper <= 80.0).all()
 
 
 @pytest.fixture(scope="module")
@@ -22,17 +72,10 @@ def fed(scenario, problem, parameters, predict):
     """Give θ, (update by update), of offset-free control that meets given prediction errors."""
 
     def feed(errors, start=parameters, **settings):
-        cls = load_algorithm("offset-free")
         settings = {"memory": MEMORY, "update_every": 1, **settings}
-        controller = SimpleNamespace(parameters=start, theta=start.theta)
-        rule = cls(
-            controller,
-            scenario,
-            cls.Configuration.from_dict(settings),
-            len(errors),
-            None,
-            np.random.default_rng(0),
-        )
+        configuration = OffsetFree.Configuration.from_dict(settings)
+        controller, rng = Carrier(start), np.random.default_rng(0)
+        rule = OffsetFree(controller, scenario, configuration, len(errors), None, rng)
         s, a, seen = problem.reference_state, problem.reference_action, []
         expected = predict(s, a)
         for number, error in enumerate(errors):
@@ -42,18 +85,18 @@ def fed(scenario, problem, parameters, predict):
                     s=s,
                     a=a,
                     explored=False,
-                    policy=None,
-                    action_value=None,
+                    solution=None,
+                    q_solution=None,
                     stage_cost=1.0,
                     cost=1.0,
                     next_s=expected + error,
                     next_penalty=0.0,
-                    next_policy=None,
+                    next_solution=None,
                     point=None,
                     next_point=None,
                 )
             )
-            seen.append(start.with_theta(np.array(rule.theta)))
+            seen.append(controller.parameters)
         return seen
 
     return feed

@@ -4,7 +4,6 @@ import pytest
 from controllers.model import discretise
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.scenario import Penalty
-from learning.checkpoint import arrays_of, take_up
 from learning.prediction_errors import (
     OneStepModel,
     PredictionErrors,
@@ -41,7 +40,7 @@ def test_the_oldest_errors_are_forgotten(scenario):
         errors.add(np.array([float(k), 0.0]))
     assert sorted(errors.values[:, 0]) == [2.0, 3.0, 4.0]
     other = PredictionErrors(scenario, 3)
-    take_up(other, arrays_of(errors))
+    other.load_state_dict(errors.state_dict())
     assert np.array_equal(other.values, errors.values)
 
 

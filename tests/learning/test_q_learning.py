@@ -7,7 +7,7 @@ from controllers.rti import RtiNmpc
 from learning import QLearning
 from learning.q_learning import AverageCost, KalmanRegression
 from learning.step import Fit
-from learning.training import starting_parameters
+from learning.training_run import starting_parameters
 from tests.helpers.training import looped
 
 AS_PRINTED = {
@@ -37,9 +37,9 @@ class Bench:
 def test_the_papers_rule_takes_the_closed_form_step(plant, problem):
     bench = Bench(plant, problem, **AS_PRINTED)
     sample, _ = bench.interaction.next()
-    delta = sample.cost + plant.scenario.discount * sample.next_policy.value
-    delta -= sample.action_value.value
-    gradient = sample.action_value.value_gradient
+    delta = sample.cost + plant.scenario.discount * sample.next_solution.value
+    delta -= sample.q_solution.value
+    gradient = sample.q_solution.value_gradient
     expected = 1e-3 * delta * gradient / (1 + 1e-3 * gradient @ gradient)
     before = bench.controller.theta.copy()
     update = bench.algorithm.observe(sample)
@@ -66,7 +66,7 @@ def test_the_recursion_is_the_batch_ridge_regression(data):
     information = np.eye(4) + gradient.T @ gradient / 0.7
     assert kalman.mean == pytest.approx(np.linalg.solve(information, gradient.T @ errors / 0.7))
     assert kalman.covariance == pytest.approx(np.linalg.inv(information))
-    fit = kalman.take()
+    fit = kalman.step()
     assert fit.metric() == pytest.approx(information)
     assert fit.metric() @ fit.minimiser == pytest.approx(fit.gradient)
 
@@ -84,10 +84,10 @@ def test_a_step_that_is_too_long_is_cut_and_so_is_what_it_tells(data):
     for row, error in zip(gradient, errors, strict=True):
         free.update(error, row)
         cut.update(error, row)
-    step = free.take().minimiser
+    step = free.step().minimiser
     share = 0.5 / np.abs(step).max()
     assert share < 1
-    assert cut.take().minimiser == pytest.approx(share * step)
+    assert cut.step().minimiser == pytest.approx(share * step)
     assert cut.covariance == pytest.approx((1 - share) * np.eye(4) + share * free.covariance)
 
 
@@ -111,23 +111,23 @@ def test_discounted_target_and_untouched_fit():
     average_cost = AverageCost(0.9, 1, 10.0, 6000.0)
     assert average_cost.target(5.0, 100.0) == 95.0
     same = fit()
-    assert average_cost.take(same) is same
+    assert average_cost.absorb(same) is same
 
 
 def test_a_mean_cost_that_follows_the_td_error_is_no_part_of_the_fit():
     average_cost = AverageCost(1.0, 1, 10.0, 6000.0, 4)
     average_cost.follow(8.0)
     assert average_cost.mean_cost == 6002.0
-    assert average_cost.fitted(np.ones(3)).tolist() == [1.0, 0.0, 1.0]
+    assert average_cost.without_level(np.ones(3)).tolist() == [1.0, 0.0, 1.0]
     fitted = AverageCost(1.0, 1, 10.0, 6000.0)
     fitted.follow(8.0)
-    assert (fitted.mean_cost, fitted.fitted(np.ones(3)).tolist()) == (6000.0, [1.0] * 3)
+    assert (fitted.mean_cost, fitted.without_level(np.ones(3)).tolist()) == (6000.0, [1.0] * 3)
 
 
 def test_mean_cost_takes_the_step_of_c_lambda():
     average_cost = AverageCost(1.0, 1, 10.0, 6000.0)
     assert average_cost.target(6001.0, 100.0) == 101.0
-    rest = average_cost.take(fit())
+    rest = average_cost.absorb(fit())
     assert average_cost.mean_cost == pytest.approx(6000.0 - 4.0)
     assert rest.minimiser.tolist() == [0.3, 0.0]
     assert rest.gradient == pytest.approx(rest.metric() @ rest.minimiser)

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from qpsolvers import solve_qp
 
 from controllers.theta import Parameters, ThetaBlocks
-from learning.checkpoint import arrays_of, take_up
 from learning.configuration import Configuration
 from learning.step import (
     ConstrainedStep,
@@ -110,7 +109,7 @@ def test_every_step_is_definite_and_certified(blocks, parameters, rng):
 def test_a_free_step_that_is_definite_is_taken_as_it_is(blocks, parameters, rng):
     fit = random_fit(blocks, rng, size=1e-3)
     carrier = Carrier(parameters)
-    update = ConstrainedStep(carrier, Configuration()).take(fit, 0.0)
+    update = ConstrainedStep(carrier, Configuration()).apply(fit, 0.0)
     assert np.array_equal(carrier.theta, parameters.theta + blocks.scale * fit.minimiser)
     assert not update.corrected
 
@@ -144,15 +143,15 @@ def towards(blocks, **values):
 def test_a_hessian_keeps_its_units_in_other_coordinates(controller):
     scale = np.linspace(0.1, 7.0, controller.theta.size)
     step = ConstrainedStep(controller, Configuration(), scale)
-    update = step.take(towards(step.blocks, c_lambda=1.0), td_error=1.0)
+    update = step.apply(towards(step.blocks, c_lambda=1.0), td_error=1.0)
     parameters = controller.parameters
     assert update.smallest_eigenvalue == smallest_eigenvalue(parameters.blocks, parameters.theta)
 
 
-def test_take_moves_theta_by_the_scaled_step(controller):
+def test_it_moves_theta_by_the_scaled_step(controller):
     step = ConstrainedStep(controller, Configuration())
     before = controller.theta.copy()
-    update = step.take(towards(step.blocks, c_lambda=2.0, x_l=[0.5, 0.0]), td_error=3.0)
+    update = step.apply(towards(step.blocks, c_lambda=2.0, x_l=[0.5, 0.0]), td_error=3.0)
     assert (
         controller.parameters["c_lambda"]
         == before[controller.parameters.blocks.slices["c_lambda"]] + 2e3
@@ -164,7 +163,7 @@ def test_take_moves_theta_by_the_scaled_step(controller):
 
 def test_slack_weights_stay_above_what_exactness_asks_for(controller):
     step = ConstrainedStep(controller, Configuration())
-    step.take(towards(step.blocks, w_sigma=-1e6, W_sigma=-1e6), 0.0)
+    step.apply(towards(step.blocks, w_sigma=-1e6, W_sigma=-1e6), 0.0)
     assert controller.parameters["w_sigma"].tolist() == [61.0, 61.0]
     assert controller.parameters["W_sigma"].tolist() == [1.0, 1.0]
 
@@ -172,7 +171,7 @@ def test_slack_weights_stay_above_what_exactness_asks_for(controller):
 def test_bounds_that_would_cross_refuse_the_step(controller):
     step = ConstrainedStep(controller, Configuration())
     before = controller.theta.copy()
-    update = step.take(towards(step.blocks, x_l=[200.0, 0.0], b_l=1.0), 0.0)
+    update = step.apply(towards(step.blocks, x_l=[200.0, 0.0], b_l=1.0), 0.0)
     assert update.refused and update.step == 0.0
     assert np.array_equal(controller.theta, before)
 
@@ -189,7 +188,7 @@ def test_a_trust_region_holds_after_the_lmi(controller, rng):
         minimiser = rng.normal(size=size) * 3.0
         fit = Fit(metric @ minimiser, minimiser, lambda metric=metric: metric)
         before = controller.theta.copy()
-        update = step.take(fit.within(3.0, np.linalg.norm), 0.0)
+        update = step.apply(fit.within(3.0, np.linalg.norm), 0.0)
         assert np.linalg.norm((controller.theta - before) / step.scale) <= 3.0 * (1 + 1e-9)
         assert update.smallest_eigenvalue >= least * (1 - 1e-9)
         corrected += update.corrected
@@ -199,7 +198,7 @@ def test_a_trust_region_holds_after_the_lmi(controller, rng):
 def test_a_flat_start_is_not_lifted(problem):
     flat = Carrier(Parameters.naive(problem).replace({"B_l": np.diag([1.0, 1.0, 1e-4, 1.0])}))
     step = ConstrainedStep(flat, Configuration())
-    update = step.take(towards(step.blocks, x_l=[0.1, 0.0]), 0.0)
+    update = step.apply(towards(step.blocks, x_l=[0.1, 0.0]), 0.0)
     assert not update.corrected
     assert flat.parameters["B_l"][2, 2] == 1e-4
 
@@ -223,5 +222,5 @@ def test_a_restored_step_keeps_the_least_eigenvalue_of_where_it_began(controller
     controller.theta = parameters.replace({"B_l": 0.5 * parameters["B_l"]}).theta
     resumed = ConstrainedStep(controller, small)
     assert resumed._smallest != step._smallest
-    take_up(resumed, arrays_of(step))
+    resumed.load_state_dict(step.state_dict())
     assert resumed._smallest == step._smallest

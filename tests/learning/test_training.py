@@ -4,8 +4,9 @@ import pytest
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from learning.algorithm import Update
+from learning.log import to_csv
 from learning.q_learning import QLearning
-from learning.training import run_training, to_csv
+from learning.training import run_training
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed
 

@@ -1,24 +1,14 @@
-"""The log of a training, and the judge of its θ."""
+"""What a training is, and where its θ starts."""
 
 import numpy as np
 import pytest
 
-from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
-from cosim import FmuPlant
-from cosim.simulation import indicators_of
 from learning import QLearning
-from learning.algorithm import Strategy
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.training import (
-    FIGURES,
-    HELD_OUT,
-    Judge,
-    prepare,
-    starting_parameters,
-)
-from tests.helpers.training import make_run
+from learning.exploration import Strategy
+from learning.training_run import make_run, starting_parameters
 
 
 def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(problem):
@@ -39,7 +29,7 @@ def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(proble
 def test_what_is_not_given_of_log_evaluation_and_checkpoint_fits_the_rest(
     scenario, given, expected
 ):
-    run = prepare("q-learning", scenario, 100, None, {"seed": 0, **given})
+    run = make_run("q-learning", scenario, 100, **given)
     assert (run.log_every, run.evaluate_every, run.checkpoint_every) == expected
 
 
@@ -84,30 +74,3 @@ def test_a_file_keeps_its_own_slack_weights_and_model_parameters(problem, tmp_pa
     }
     with pytest.raises(ConfigurationError, match="parametrisation=extended"):
         starting_parameters(problem, Configuration(parametrisation="paper"), path)
-
-
-def judge(plant, parameters, optimum=None):
-    run = make_run("q-learning", plant.scenario, divergence=1.5, evaluation_steps=30)
-    return Judge(run, plant, parameters, optimum)
-
-
-def test_the_judge_sets_theta_and_evaluates_greedily(scenario, problem, parameters):
-    other = parameters.replace({"x_l": np.array([26.0, 40.0])})
-    with FmuPlant(scenario) as plant:
-        found = judge(plant, parameters).verdict(other.theta)
-        own = indicators_of(plant, RtiNmpc(problem, other), [HELD_OUT], 30)
-    assert [found[name] for name in FIGURES] == [own[name][0] for name in FIGURES]
-
-
-def test_the_naive_controller_is_the_judges_zero_the_optimum_its_one(scenario, problem, parameters):
-    other = RtiNmpc(problem, parameters.replace({"x_l": np.array([26.0, 40.0])}))
-    with FmuPlant(scenario) as plant:
-        judged = judge(plant, parameters, optimum=other)
-        naive, optimum = judged.verdict(parameters.theta), judged.verdict(other.theta)
-        assert (naive["gap_closed"], optimum["gap_closed"]) == (0.0, 1.0)
-        best = indicators_of(plant, other, [HELD_OUT], 30)["J"][0]
-        assert naive["regret"] == pytest.approx(naive["J"] / best - 1)
-        assert optimum["regret"] == 0.0
-        assert judged.limit == pytest.approx(1.5 * naive["J"])
-        unknown = judge(plant, parameters).verdict(parameters.theta)
-        assert unknown["gap_closed"] is unknown["regret"] is None

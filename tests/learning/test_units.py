@@ -6,7 +6,7 @@ import pytest
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
-from learning.training import starting_parameters
+from learning.training_run import starting_parameters
 from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
 from tests.helpers.training import looped
 
@@ -42,7 +42,7 @@ def learnt(scenario, cls, start, units):
     actions, corrected = [], 0
     for _ in range(SAMPLES):
         sample, _ = loop.next()
-        actions.append(sample.policy.action)
+        actions.append(sample.solution.action)
         if (update := rule.observe(sample)) is not None:
             corrected += update.corrected
             loop.renew()

@@ -78,7 +78,7 @@ import helper_of_mine
 from learning import QLearning
 
 class Mine(QLearning):
-    asks_for = "operation"
+    requires = "operation"
 """
 
 
@@ -87,7 +87,7 @@ def test_a_run_of_an_edited_rule_is_not_resumed(cosim, unwatched, undrawn, tmp_p
     (tmp_path / "helper_of_mine.py").write_text("X = 1\n")
     own = ("train", "-a", "mine:Mine", *SHORT[3:], "--out", "run")
     assert cosim(*own)[0] == 0
-    assert json.loads((tmp_path / "run/summary.json").read_text())["asks_for"] == "operation"
+    assert json.loads((tmp_path / "run/summary.json").read_text())["requires"] == "operation"
     assert cosim(*own, "--resume")[0] == 0
     (tmp_path / "helper_of_mine.py").write_text("X = 2\n")
     code, _, err = cosim(*own, "--resume")

@@ -14,7 +14,7 @@ from controllers.problem import Problem
 from controllers.rti.nmpc import RtiSolution
 from cosim.cli.main import app
 from cosim.plant.wiring import Wiring
-from learning.baselines import BackOffSearch
+from learning.back_off import BackOffSearch
 
 pytestmark = pytest.mark.campaign
 STORED = Path(__file__).parents[3] / "results"
@@ -57,8 +57,8 @@ def gradient(patch):
 
 def back_off(patch):
     """The rule that moves the bounds."""
-    at = BackOffSearch.at
-    patch.setattr(BackOffSearch, "at", lambda self, kappa: at(self, 1.01 * kappa))
+    exact = BackOffSearch.backed_off
+    patch.setattr(BackOffSearch, "backed_off", lambda self, kappa: exact(self, 1.01 * kappa))
 
 
 @pytest.fixture(scope="module")

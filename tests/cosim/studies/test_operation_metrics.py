@@ -9,7 +9,7 @@ from controllers.factories import nmpc
 from cosim import FmuPlant, Scenario, study
 from cosim.simulation import spawn_seeds
 from cosim.studies.operation import LIFE, SHIFT, dearer_than, judged, metrics, tables
-from learning.training import prepare
+from learning.training_run import make_run
 from tests.helpers.toy_study import case, document
 
 NOBODY = np.zeros(1000, dtype=bool)
@@ -206,9 +206,7 @@ def test_the_first_change_counts_the_samples_before_it_and_their_cost_is_the_sta
 def start_in_closed_loop(samples, seed):
     """Costs of θ as it starts, and whether a bound is violated, in a loop of this test's own."""
     scenario = Scenario.load("paper")
-    run = prepare(
-        scenario=scenario, algorithm="held", samples=samples, settings={}, options={"seed": seed}
-    )
+    run = make_run("held", scenario, samples, seed=seed)
     controller = nmpc(scenario, run.starting_parameters(), "rti")
     costs, violating = [], []
     with FmuPlant(scenario) as plant:

@@ -1,0 +1,88 @@
+"""Greedy evaluation of a training's θ on held-out noise."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from controllers import compile_functions
+from controllers.factories import nmpc
+from controllers.problem import Problem
+from controllers.theta import Parameters
+from cosim.protocols import Array, Controller, Plant
+from cosim.simulation import indicators_of
+from cosim.statistics import gap_closed, regret
+from learning.log import METRICS
+
+if TYPE_CHECKING:
+    from learning.training_run import TrainingRun
+
+HELD_OUT = 1_000_000
+"""First of the held-out seeds; training seeds stay below."""
+
+
+class Evaluator:
+    """Evaluates a run's θ by its greedy policy on the held-out seeds.
+
+    Args:
+        run: says how many seeds and samples.
+        plant: of its scenario.
+        start: θ where the run starts.
+        optimum: its J on the same seeds is J*; None: unknown.
+
+    Attributes:
+        start_J: J of the start.
+        baselines: J of naive and, where it is known, optimal.
+        limit: greedy J above which a run has diverged.
+    """
+
+    def __init__(
+        self,
+        run: TrainingRun,
+        plant: Plant,
+        start: Parameters,
+        optimum: Controller | None,
+    ) -> None:
+        self._run = run
+        self._plant = plant
+        self._controller = nmpc(run.scenario, start, run.controller)
+        # Gap closed is measured from naive to optimal, on the same noise.
+        naive = Parameters.naive(Problem.from_scenario(run.scenario))
+        self._naive_costs = self._costs(nmpc(run.scenario, naive, run.controller))["J"]
+        self._optimal_costs = np.full(run.evaluation_seeds, np.nan)
+        self.start_J = float(self._costs(self._controller)["J"].mean())
+        self.baselines = {"naive": float(self._naive_costs.mean())}
+        if optimum is not None:
+            self._optimal_costs = self._costs(optimum)["J"]
+            self.baselines["optimal"] = float(self._optimal_costs.mean())
+        # A cost may be negative (a profit): the margin is a share of its magnitude.
+        worst = max(self.baselines["naive"], self.start_J)
+        self.limit = worst + (run.divergence - 1) * abs(worst)
+
+    def evaluate(self, theta: Array) -> dict[str, Any]:
+        """The greedy policy at θ (n_θ,).
+
+        Returns:
+            Means of `METRICS`, `failures` a sum; `regret`, its 95 % `regret_interval` over the
+            runs, and `gap_closed`, None where unknown.
+        """
+        self._controller.theta = theta
+        costs = self._costs(self._controller)
+        metrics: dict[str, Any] = {name: float(costs[name].mean()) for name in METRICS}
+        metrics["failures"] = int(costs["failures"].sum())
+        excess = regret(costs["J"], self._optimal_costs)
+        gap = gap_closed(costs["J"], self._naive_costs, self._optimal_costs)
+        known = isfinite(excess.value)
+        metrics["regret"] = excess.value if known else None
+        metrics["regret_interval"] = excess.interval
+        metrics["gap_closed"] = gap.value if known else None
+        return metrics
+
+    def _costs(self, policy: Controller) -> dict[str, Array]:
+        """Indicators of a controller on the held-out seeds, (K,) each."""
+        seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
+        # All runs together say whether compiling pays.
+        compile_functions(policy, self._run.evaluation_steps * len(seeds))
+        return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)

@@ -1,0 +1,75 @@
+"""Exploration: which samples apply another action than the policy's, and which one."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from cosim.protocols import Matrix, Vector
+from cosim.scenario import Scenario
+from learning.configuration import Configuration
+from learning.errors import ConfigurationError
+
+
+class Strategy:
+    """Draws the actions that explore: a = sat(c + e), e ~ N(0, diag σ²), on a share of the samples.
+
+    The centre c is the policy's action (`additive`) or zero (`literal`, as the paper prints it).
+
+    Attributes:
+        probability: share of the samples that explore.
+        deviation: σ, (m,) or (1,), in the actions' units.
+        lower, upper: bounds (m,) at which the loop saturates.
+
+    Raises:
+        ConfigurationError: a wrong number of deviations.
+    """
+
+    def __init__(self, configuration: Configuration, scenario: Scenario) -> None:
+        self.kind = configuration.exploration
+        self.lower = scenario.action_lower
+        self.upper = scenario.action_upper
+        self.deviation: Vector = configuration.exploration_share * (self.upper - self.lower)
+        if configuration.exploration_deviation is not None:
+            self.deviation = np.array(configuration.exploration_deviation)
+        if self.deviation.size not in (1, self.lower.size):
+            raise ConfigurationError(
+                f"exploration_deviation has {self.deviation.size} entries; give one, or one for "
+                f"each of the {self.lower.size} actions"
+            )
+        self.probability = configuration.exploration_probability
+        if self.kind == "none":
+            self.probability = 0.0
+
+    def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
+        """Exploring action (m,) in place of the policy's `action`; None: greedy."""
+        # Draw in every sample, so that runs of any probability stay paired.
+        draw = rng.random()
+        e = rng.standard_normal(self.lower.size)
+        if draw >= self.probability:
+            return None
+        exploring: Vector = self._centre(action) + self.deviation * e
+        return exploring
+
+    def bias(self, actions: Matrix) -> Matrix:
+        """E[a − π | explored] of samples with policies π, (K, m).
+
+        The mean of the censored normal distribution less π; zero without saturation if the centre
+        is π.
+        """
+        centres = self._centre(actions)
+        # Without a deviation the censored normal is a point: a tiny one gives its limit.
+        sigma = np.maximum(self.deviation, np.finfo(float).tiny)
+        low = (self.lower - centres) / sigma
+        high = (self.upper - centres) / sigma
+        # Mean of min(max(c + e, lower), upper): the density at the bounds, and their tails.
+        density_low = np.exp(-(low**2) / 2)
+        density_high = np.exp(-(high**2) / 2)
+        density = (density_low - density_high) / np.sqrt(2 * np.pi)
+        tail_low = low * ndtr(low)
+        tail_high = high * ndtr(-high)
+        mean: Matrix = sigma * (density + tail_low + tail_high)
+        return mean + (centres - actions)
+
+    def _centre(self, action: Vector) -> Vector:
+        return np.zeros_like(action) if self.kind == "literal" else action

@@ -1,0 +1,15 @@
+"""The baseline of learning in operation: θ never changes."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from learning.algorithm import Algorithm
+from learning.configuration import Configuration, GreedyConfiguration
+
+
+class Fixed(Algorithm):
+    """θ stays at its start."""
+
+    Configuration: ClassVar[type[Configuration]] = GreedyConfiguration
+    explores = False

@@ -1,0 +1,303 @@
+"""The loop of plant, controller and learning rule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
+from controllers.theta import Parameters
+from cosim.plant import FmuPlant
+from cosim.protocols import Plant, Step, Vector
+from cosim.scenario import Scenario
+from cosim.simulation import recover
+from learning.algorithm import Algorithm, Transition, Update
+from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
+from learning.errors import PrivilegeError
+from learning.exploration import Strategy
+
+FLAGS_EVERY = 10
+"""Samples between two checks of a solution's flags, which cost as much as a feedback."""
+
+
+class PlantInOperation:
+    """A plant that can only take its next sample: no reset, no snapshot, no choice of noise."""
+
+    __slots__ = ("scenario", "step")
+    step: Callable[[Vector], Step]
+
+    def __init__(self, plant: Plant | PlantInOperation) -> None:
+        self.scenario: Scenario = plant.scenario
+
+        # A closure: no attribute of this object leads to the plant.
+        def step(a: Vector) -> Step:
+            return plant.step(a)
+
+        self.step = step
+
+
+@dataclass
+class Counts:
+    """Counts since a loop's start.
+
+    Attributes:
+        number: samples.
+        failures: of the controller.
+        explored: samples that explored.
+        saturated: of these, samples at an actuator's bound.
+        weakly_active: of every tenth sample, policies with one-sided derivatives.
+        licq_failed: of every tenth sample, policies with dependent active constraints.
+    """
+
+    number: int = 0
+    failures: int = 0
+    explored: int = 0
+    saturated: int = 0
+    weakly_active: int = 0
+    licq_failed: int = 0
+
+
+class TrainingLoop:
+    """Takes samples from a plant and lets a rule move the controller's θ.
+
+    V(s₊) of a sample is V(s) of the next one, so a greedy sample costs one QP. Where the controller
+    fails, the last action is applied once more, the failure is counted and the controller starts
+    from its reference.
+
+    Args:
+        plant: has been reset; a rule that requires `operation` gets it as a `PlantInOperation`.
+        controller: carries θ.
+        algorithm: the rule.
+        strategy: the exploration.
+        rng: draws the exploration.
+        rest_after: samples after which θ stays and nothing explores; None: never.
+        algorithm_rng: the rule's own generator, which checkpoints keep.
+    """
+
+    def __init__(
+        self,
+        plant: FmuPlant | PlantInOperation,
+        controller: RtiNmpc,
+        algorithm: Algorithm,
+        strategy: Strategy,
+        rng: np.random.Generator,
+        rest_after: int | None = None,
+        algorithm_rng: np.random.Generator | None = None,
+    ) -> None:
+        scenario = plant.scenario
+        # A rule in operation cannot reach the plant, not even by an attribute.
+        self._simulator: Any = None
+        self._plant: FmuPlant | PlantInOperation = PlantInOperation(plant)
+        if algorithm.requires == "simulator":
+            self._simulator = plant
+            self._plant = plant
+        self.controller = controller
+        self.algorithm = algorithm
+        self.rng = rng
+        self._algorithm_rng = algorithm_rng
+        self._strategy = strategy
+        self.start_parameters = controller.parameters
+        self._rest_after = inf if rest_after is None else rest_after
+        self._lower = scenario.action_lower
+        self._upper = scenario.action_upper
+        self._penalty = scenario.state_penalty
+        self._applied = scenario.reference_action
+        self._solution: RtiSolution | None = None
+        self._point: LinearisationPoint | None = None
+        self.s: Vector = scenario.initial_state
+        self.counts = Counts()
+
+    def start(self, s: Vector) -> None:
+        """Begin an episode at the state s (n,) to which the plant has been reset."""
+        self.s = s
+        self.controller.reset()
+        self._solution = self._solve(self.s, prepare=True)
+
+    @property
+    def parameters(self) -> Parameters:
+        """The final θ so far: the rule's own where it reports one, else the controller's."""
+        theta = getattr(self.algorithm, "theta", None)
+        present = self.controller.parameters
+        return present if theta is None else present.with_theta(theta)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether exploration and learning have ended (`rest_after`)."""
+        return self.counts.number >= self._rest_after
+
+    def advance(self) -> tuple[float, Update | None]:
+        """One sample of plant and rule.
+
+        Returns:
+            The sample's share of J, and the update if θ moved.
+
+        Raises:
+            DivergenceError: by the rule.
+            PrivilegeError: the rule asks more of the plant than it `requires`.
+        """
+        # Asked before the sample: the last one that may teach still does.
+        has_ended = self.has_ended
+        transition, cost = self.next()
+        if has_ended:
+            return cost, None
+        update: Update | None = None
+        if transition is not None:
+            update = self.algorithm.observe(transition)
+        elif hasattr(self.algorithm, "failed"):
+            update = self.algorithm.failed(cost)
+        if update is None:
+            return cost, None
+        self.counts.failures += update.failures
+        # A new episode begins; else θ has moved under the present state.
+        if update.episode is not None:
+            self.start(self.simulator("episode").reset(update.episode))
+        else:
+            self.renew()
+        return cost, update
+
+    def renew(self) -> None:
+        """Solve again for the present state at the same linearisation point, after θ has moved."""
+        if self._point is not None:
+            self.controller.prepare_at(self._point)
+            self._solution = self._solve(self.s)
+
+    def next(self) -> tuple[Transition | None, float]:
+        """One sample of the plant.
+
+        Returns:
+            Its transition, None after a failure, and its share of J.
+        """
+        solution = self._solution
+        point = self._point
+        s = self.s
+        number = self.counts.number
+        a, explored = self._choose(solution)
+        # V and Q are one where a = π(s): a greedy sample costs one QP.
+        q_solution = solution
+        if explored and self.algorithm.needs_q_solution:
+            q_solution = self._solve(s, a)
+        if solution is not None and number % FLAGS_EVERY == 0:
+            self.counts.weakly_active += solution.weakly_active
+            self.counts.licq_failed += not solution.licq
+        step = self._plant.step(a)
+        # A rule reads what was measured, and changes nothing.
+        for array in (s, a, step.s, step.disturbance):
+            array.flags.writeable = False
+        # The solution at s₊ serves the next sample too.
+        self._applied = a
+        self.s = step.s
+        self.counts.number = number + 1
+        self._solution = self._solve(self.s, prepare=True)
+        cost = step.stage_cost + step.penalty
+        if solution is None or q_solution is None or self._solution is None:
+            return None, cost
+        needs_points = self.algorithm.needs_points
+        transition = Transition(
+            number=number,
+            s=s,
+            a=a,
+            explored=explored,
+            solution=solution,
+            q_solution=q_solution,
+            stage_cost=step.stage_cost,
+            cost=cost,
+            next_s=self.s,
+            next_penalty=self._penalty(self.s.tolist()),
+            next_solution=self._solution,
+            point=point if needs_points else None,
+            next_point=self._point if needs_points else None,
+        )
+        return transition, cost
+
+    def _choose(self, solution: RtiSolution | None) -> tuple[Vector, bool]:
+        """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
+        if solution is None:
+            return self._applied, False
+        exploring: Vector | None = None
+        if not self.has_ended and getattr(self.algorithm, "explores", True):
+            exploring = self._strategy(solution.action, self.rng)
+        wanted = solution.action if exploring is None else exploring
+        # The QP keeps bounds to its tolerance, the actuator exactly.
+        a = np.clip(wanted, self._lower, self._upper)
+        if exploring is None:
+            return a, False
+        self.counts.explored += 1
+        at_bound = (a == self._lower) | (a == self._upper)
+        self.counts.saturated += bool(at_bound.any())
+        return a, True
+
+    def simulator(self, privilege: str) -> Any:
+        """The plant as a simulator, for a privilege; raises PrivilegeError if not required."""
+        if self._simulator is None:
+            raise PrivilegeError(
+                f"{type(self.algorithm).__name__} requires a plant in operation, and says "
+                f"'{privilege}', which only a simulator can; state requires = \"simulator\""
+            )
+        return self._simulator
+
+    def _solve(
+        self,
+        s: Vector,
+        a: Vector | None = None,
+        *,
+        prepare: bool = False,
+    ) -> RtiSolution | None:
+        """V(s) and π(s), or Q(s, a); None after a failure, which is counted."""
+        try:
+            if prepare:
+                self.controller.prepare()
+                self._point = self.controller.linearisation_point
+            return self.controller.feedback(s, a)
+        except Exception as error:
+            recover(self.controller, error)
+        # Without a linearisation point the next sample begins at the reference.
+        self.counts.failures += 1
+        self._point = None
+        return None
+
+    def restart(self) -> None:
+        """Reset the controller but for its linearisation point.
+
+        Done at each checkpoint and on resuming, so that both runs have the same digits.
+        """
+        self.controller.reset()
+        if self._point is None:
+            self._solution = self._solve(self.s, prepare=True)
+        else:
+            self.renew()
+
+    def state_dict(self) -> State:
+        """Arrays and numbers of loop and rule, θ included, without the plant's."""
+        state: State = {
+            "theta": self.controller.theta,
+            "s": self.s,
+            "applied": self._applied,
+            "rng": generator_state(self.rng),
+        }
+        if self._algorithm_rng is not None:
+            state["algorithm_rng"] = generator_state(self._algorithm_rng)
+        if self._point is not None:
+            state |= prefixed("point", self._point._asdict())
+        state |= prefixed("counts", asdict(self.counts))
+        state |= prefixed("algorithm", self.algorithm.state_dict())
+        return state
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned; the plant must have been restored before."""
+        self.controller.theta = state["theta"]
+        self.s = state["s"]
+        self._applied = state["applied"]
+        # A failed sample has left no linearisation point.
+        point = part_of(state, "point")
+        self._point = LinearisationPoint(**point) if point else None
+        self.counts = Counts(**part_of(state, "counts"))
+        self.algorithm.load_state_dict(part_of(state, "algorithm"))
+        # Only now: a rule may draw while it restores itself.
+        set_generator_state(self.rng, state["rng"])
+        if self._algorithm_rng is not None:
+            set_generator_state(self._algorithm_rng, state["algorithm_rng"])
+        self.restart()

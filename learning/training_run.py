@@ -1,0 +1,326 @@
+"""What a training is: its identity, its start, and its loop at the start."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from math import gcd, inf
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controllers.economic import tune
+from controllers.factories import nmpc
+from controllers.problem import Problem
+from controllers.theta import Parameters, ThetaBlocks
+from cosim.identity import depends_on
+from cosim.plant import FmuPlant
+from cosim.scenario import Scenario
+from cosim.simulation import spawn_seeds
+from cosim.validation import suggestion
+from learning.algorithm import Algorithm, load_algorithm
+from learning.backed_off import add_reserve, back_off
+from learning.configuration import Configuration
+from learning.errors import ConfigurationError
+from learning.evaluator import HELD_OUT
+from learning.exploration import Strategy
+from learning.loop import TrainingLoop
+
+DEFAULT_SAMPLES = 50_000
+"""Length of a run where neither user nor algorithm states one."""
+STARTS = ("naive", "tuned", "commissioned", "cautious")
+CARRIERS = ("rti", "converged")
+"""Controllers that can carry θ."""
+COUNTS = (
+    "samples", "log_every", "evaluate_every", "checkpoint_every",
+    "evaluation_seeds", "evaluation_steps", "rest_after",
+)  # fmt: skip
+"""Attributes of a `TrainingRun` that are whole numbers from 1 on."""
+OPTIONAL = ("samples", "log_every", "evaluate_every", "checkpoint_every", "rest_after")
+"""Options of a training that may be None."""
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """The identity of a training run; only an identical one can resume a checkpoint.
+
+    Attributes:
+        algorithm: name of a registered one, or `module:Class`.
+        scenario: the plant, its bounds and costs.
+        samples: of the plant.
+        seed: of noise and exploration.
+        configuration: the hyperparameters; completed by what the scenario states.
+        controller: `rti` or `converged`; it carries θ.
+        log_every: samples per row of the log.
+        evaluate_every: samples per greedy evaluation of θ.
+        checkpoint_every: samples per checkpoint.
+        evaluation_seeds: held-out seeds of an evaluation.
+        evaluation_steps: samples of each of them.
+        divergence: a run has diverged, and ends, where its greedy J exceeds the larger of the naive
+            θ's and the start's by more than (divergence − 1) of its magnitude, twice in a row or at
+            the end.
+        start: `naive`, `tuned`, `commissioned`, `cautious` or the path of a file of θ.
+        rest_after: samples after which θ stays and nothing explores; None: never.
+
+    Raises:
+        ConfigurationError: counts that make no run.
+    """
+
+    algorithm: str
+    scenario: Scenario
+    samples: int
+    seed: int
+    configuration: Configuration
+    controller: str = "rti"
+    log_every: int = 1000
+    evaluate_every: int = 5000
+    checkpoint_every: int = 5000
+    evaluation_seeds: int = 4
+    evaluation_steps: int = 500
+    divergence: float = 1.5
+    start: str = "naive"
+    rest_after: int | None = None
+
+    def __post_init__(self) -> None:
+        completed = self.configuration.for_scenario(self.scenario)
+        object.__setattr__(self, "configuration", completed)
+        if self.seed < 0:
+            raise ConfigurationError(f"seed must be at least 0, not {self.seed}")
+        if self.seed >= HELD_OUT:
+            raise ConfigurationError(
+                f"seed must be below {HELD_OUT}, not {self.seed}: the noise from there on is held "
+                "out, to evaluate what was learned"
+            )
+        for name in COUNTS:
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigurationError(f"{name} must be at least 1, not {value}")
+        for name in ("evaluate_every", "checkpoint_every"):
+            value = getattr(self, name)
+            if value % self.log_every:
+                raise ConfigurationError(
+                    f"{name} = {value} must be a multiple of log_every = {self.log_every}"
+                )
+
+    def identity(self) -> dict[str, Any]:
+        """The run as JSON-ready values, with the hashes of all code that its result depends on."""
+        # All attributes: whatever differs makes another run.
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        values["scenario"] = self.scenario.hash
+        values["configuration"] = self.configuration.model_dump(mode="json")
+        file = Path(self.start)
+        if file.is_file():
+            values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        values["source"] = depends_on(self.scenario, self.algorithm)
+        return values
+
+    def starting_parameters(self) -> Parameters:
+        """θ where the run starts; raises what the function `starting_parameters` raises."""
+        problem = Problem.from_scenario(self.scenario)
+        if self.start not in ("commissioned", "cautious"):
+            return starting_parameters(problem, self.configuration, self.start)
+        tuned = starting_parameters(problem, self.configuration, "tuned")
+        backed_off = back_off(tuned, self.scenario)
+        if self.start == "commissioned":
+            return backed_off
+        return add_reserve(backed_off, self.scenario)
+
+
+def make_run(
+    algorithm: str,
+    scenario: Scenario,
+    samples: int | None = None,
+    settings: Mapping[str, Any] | Configuration | None = None,
+    *,
+    seed: int = 0,
+    start: str = TrainingRun.start,
+    controller: str = TrainingRun.controller,
+    log_every: int | None = None,
+    evaluate_every: int | None = None,
+    checkpoint_every: int | None = None,
+    evaluation_seeds: int = TrainingRun.evaluation_seeds,
+    evaluation_steps: int = TrainingRun.evaluation_steps,
+    divergence: float = TrainingRun.divergence,
+    rest_after: int | None = TrainingRun.rest_after,
+) -> TrainingRun:
+    """The run of an algorithm by name, checked; arguments that are not below are its attributes.
+
+    Args:
+        samples: None: the algorithm's budget, else 50 000.
+        settings: hyperparameters by name, or all of them.
+        log_every, evaluate_every, checkpoint_every: where not given, near their defaults and so
+            that they fit the others.
+
+    Raises:
+        AlgorithmLookupError: there is no such algorithm.
+        ConfigurationError: settings or options of another kind, or that make no run.
+    """
+    rule = load_algorithm(algorithm)
+    _check_options(
+        {
+            "samples": samples,
+            "seed": seed,
+            "start": start,
+            "controller": controller,
+            "log_every": log_every,
+            "evaluate_every": evaluate_every,
+            "checkpoint_every": checkpoint_every,
+            "evaluation_seeds": evaluation_seeds,
+            "evaluation_steps": evaluation_steps,
+            "divergence": divergence,
+            "rest_after": rest_after,
+        }
+    )
+    if settings is not None and not isinstance(settings, Configuration | Mapping):
+        raise ConfigurationError(f"settings must be a table, not a {type(settings).__name__}")
+    if not isinstance(settings, Configuration):
+        settings = rule.Configuration.from_dict(dict(settings or {}))
+    if samples is None:
+        samples = getattr(rule, "budget", DEFAULT_SAMPLES)
+    if log_every is None:
+        log_every = _fitting_log_interval(evaluate_every, checkpoint_every)
+    # Evaluations near their default, on rows of the log.
+    rows = max(1, round(TrainingRun.evaluate_every / max(1, log_every)))
+    return TrainingRun(
+        algorithm=algorithm,
+        scenario=scenario,
+        samples=samples,
+        seed=seed,
+        configuration=settings,
+        controller=controller,
+        log_every=log_every,
+        evaluate_every=rows * log_every if evaluate_every is None else evaluate_every,
+        checkpoint_every=rows * log_every if checkpoint_every is None else checkpoint_every,
+        evaluation_seeds=evaluation_seeds,
+        evaluation_steps=evaluation_steps,
+        divergence=divergence,
+        start=start,
+        rest_after=rest_after,
+    )
+
+
+def _check_options(options: Mapping[str, Any]) -> None:
+    """Refuse options of another kind than the attributes of `TrainingRun` by ConfigurationError."""
+    for name, value in options.items():
+        if value is None and name in OPTIONAL:
+            continue
+        kind: type = Integral
+        words = "a whole number"
+        if name in ("start", "controller"):
+            kind = str
+            words = "a text"
+        elif name == "divergence":
+            kind = Real
+            words = "a number"
+        # Python's bool is an integer, a TOML file's is not.
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise ConfigurationError(f"training: {name} must be {words}, not {value!r:.60}")
+    divergence = options["divergence"]
+    if not 1.0 <= divergence < inf:
+        raise ConfigurationError(f"training: divergence must be at least 1, not {divergence}")
+    if options["controller"] not in CARRIERS:
+        raise ConfigurationError(
+            f"training: there is no controller '{options['controller']}'; there are rti and "
+            "converged"
+        )
+
+
+def _fitting_log_interval(evaluate_every: int | None, checkpoint_every: int | None) -> int:
+    """Largest interval up to the default that divides the others where these are given."""
+    together = gcd(evaluate_every or 0, checkpoint_every or 0)
+    interval = TrainingRun.log_every
+    while together % interval:
+        interval -= 1
+    return interval
+
+
+def begin(
+    run: TrainingRun,
+    algorithm: type[Algorithm],
+    plant: FmuPlant,
+) -> TrainingLoop:
+    """The loop of a run at its start: the plant is reset, once, and the first state is solved for.
+
+    All random numbers come from the run's seed.
+
+    Args:
+        run: the run.
+        algorithm: class of its rule.
+        plant: of its scenario.
+    """
+    # Each source of randomness has its own stream, so that settings keep runs paired.
+    controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
+    strategy = Strategy(run.configuration, run.scenario)
+    plant_seed, rng = spawn_seeds(run.seed)
+    # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
+    third_child = np.random.SeedSequence(run.seed).spawn(3)[2]
+    algorithm_rng = np.random.default_rng(third_child)
+    rule = algorithm(
+        controller, run.scenario, run.configuration, run.samples, strategy, algorithm_rng
+    )
+    loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, algorithm_rng)
+    first_episode = getattr(rule, "first_episode", None)
+    if first_episode is None:
+        loop.start(plant.reset(plant_seed))
+    else:
+        loop.start(loop.simulator("first_episode").reset(first_episode))
+    return loop
+
+
+def starting_parameters(
+    problem: Problem,
+    configuration: Configuration,
+    start: str = "naive",
+) -> Parameters:
+    """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
+
+    `naive` and `tuned` take c_lambda from the configuration; blocks that a file lacks start as with
+    `naive`.
+
+    Args:
+        problem: the controller's.
+        configuration: says which blocks θ has.
+        start: `naive`, `tuned` or the path of a file of θ.
+
+    Raises:
+        ConfigurationError: the file has slack weights and the parametrisation none.
+        ParameterError: a bad file.
+        TuningError: the tuning fails.
+    """
+    meant = suggestion(start, STARTS)
+    if start not in STARTS and meant and not Path(start).exists():
+        raise ConfigurationError(f"there is no start '{start}'{meant}, nor such a parameters file")
+    file = None if start in ("naive", "tuned") else Parameters.load(start, problem)
+    if file is not None and "w_sigma" in file.blocks and configuration.parametrisation == "paper":
+        raise ConfigurationError(
+            f"{start}: θ has slack weights, which the parametrisation 'paper' has not; set "
+            "parametrisation=extended"
+        )
+    # The file's parameters first, in its order, then those that are learned.
+    labels: list[str] = []
+    if file is not None and "p" in file.blocks:
+        labels += file.blocks.block("p").labels
+    for name in configuration.learned_parameters(problem.model):
+        if name not in labels:
+            labels.append(name)
+    blocks = ThetaBlocks.of(
+        problem,
+        slack_weights=configuration.parametrisation == "extended",
+        model_parameters=tuple(labels),
+    )
+    # Blocks that the start does not say begin at values of the problem's scale.
+    if start == "tuned":
+        theta = tune(problem, blocks).parameters
+    else:
+        theta = Parameters.naive(problem, blocks)
+    if configuration.value_offset == "discounted":
+        # The level of V is that of the TD error's discount.
+        discount: float | None = getattr(configuration, "discount", None)
+        theta = theta.replace({"c_lambda": problem.value_level(discount)})
+    for name in ("w_sigma", "W_sigma"):
+        if name in blocks:
+            theta = theta.replace({name: blocks.scale[blocks.slices[name]]})
+    return theta if file is None else file.placed_in(theta)

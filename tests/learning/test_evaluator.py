@@ -1,0 +1,36 @@
+import numpy as np
+import pytest
+
+from controllers.rti import RtiNmpc
+from cosim import FmuPlant
+from cosim.simulation import indicators_of
+from learning.evaluator import HELD_OUT, Evaluator
+from learning.log import METRICS
+from tests.helpers.training import make_run
+
+
+def evaluator(plant, parameters, optimum=None):
+    run = make_run("q-learning", plant.scenario, divergence=1.5, evaluation_steps=30)
+    return Evaluator(run, plant, parameters, optimum)
+
+
+def test_it_sets_theta_and_evaluates_greedily(scenario, problem, parameters):
+    other = parameters.replace({"x_l": np.array([26.0, 40.0])})
+    with FmuPlant(scenario) as plant:
+        metrics = evaluator(plant, parameters).evaluate(other.theta)
+        own = indicators_of(plant, RtiNmpc(problem, other), [HELD_OUT], 30)
+    assert [metrics[name] for name in METRICS] == [own[name][0] for name in METRICS]
+
+
+def test_the_naive_controller_is_its_zero_the_optimum_its_one(scenario, problem, parameters):
+    other = RtiNmpc(problem, parameters.replace({"x_l": np.array([26.0, 40.0])}))
+    with FmuPlant(scenario) as plant:
+        evaluating = evaluator(plant, parameters, optimum=other)
+        naive, optimum = evaluating.evaluate(parameters.theta), evaluating.evaluate(other.theta)
+        assert (naive["gap_closed"], optimum["gap_closed"]) == (0.0, 1.0)
+        best = indicators_of(plant, other, [HELD_OUT], 30)["J"][0]
+        assert naive["regret"] == pytest.approx(naive["J"] / best - 1)
+        assert optimum["regret"] == 0.0
+        assert evaluating.limit == pytest.approx(1.5 * naive["J"])
+        unknown = evaluator(plant, parameters).evaluate(parameters.theta)
+        assert unknown["gap_closed"] is unknown["regret"] is None

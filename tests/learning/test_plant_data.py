@@ -1,0 +1,31 @@
+"""The regimes of a plant."""
+
+import numpy as np
+import pytest
+
+from learning.plant_data import PlantData
+from tests.helpers.empirical import SETTINGS, plant_data
+
+
+def test_data_from_before_a_slow_change_are_dropped(features, rng):
+    error, parts = np.zeros(features.n_parameters), []
+    for _ in range(4):
+        parts.append(plant_data(features, rng, 500, error.copy()))
+        error[0] -= 0.01
+    inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    same = np.concatenate([parts[0][0]] * 4), np.concatenate([parts[0][1]] * 4)
+    data = PlantData(features, SETTINGS)
+    assert (data.outdated(inputs, outputs), data.outdated(*same)) == (750, 0)
+
+
+@pytest.mark.parametrize(("offset", "window"), [(0.0, 0), (0.3, 15)])
+def test_a_change_of_the_plant_is_seen_and_its_absence_not(features, fitted, rng, offset, window):
+    error = -0.2 * np.eye(features.n_parameters)[0]
+    inputs, outputs = plant_data(features, rng, 240, error, offset)
+    data = PlantData(features, SETTINGS)
+    rows = np.zeros((SETTINGS.memory, 7))
+    rows[:240] = np.column_stack([inputs, outputs])
+    model = {f"model.{name}": value for name, value in fitted.state_dict().items()}
+    data.load_state_dict(data.state_dict() | {"rows": rows, "count": 240} | model)
+    assert data.changed(data.predictions()) == bool(window)
+    assert data.age == (window or 240)

@@ -66,7 +66,10 @@ static QP_APART int rti_assemble(RtiPrepared *prepared) {
                 row[j] = condensed_product(L + N_X + a, N_W, response[k], j) +
                          condensed_product(B + a, N_U, next, j);
             for (int b = 0; b < N_U; b++) row[k * N_U + b] += L[(N_X + b) * N_W + N_X + a];
-            for (int j = 0; j <= r; j++) H[r * QP_N + j] = H[j * QP_N + r] = row[j];
+            for (int j = 0; j <= r; j++) {
+                H[r * QP_N + j] = row[j];
+                H[j * QP_N + r] = row[j];
+            }
             memcpy(stack + PREPARED_F + r * N_X, row + QP_N, N_X * sizeof *row);
             stack[PREPARED_f + r] = row[OFFSET] + q[N_X + a];
         }

@@ -240,6 +240,33 @@ def test_a_plant_that_nears_its_bound_breaks_the_promise(rule, features, fitted,
         assert (rule._alarmed(fitted), data.era) == (broken, 0)
 
 
+@pytest.mark.parametrize(
+    ("present", "back_off", "moves"),
+    [(3.0, 9.0, False), (0.0, 3.0, True)],
+    ids=["dearer", "cheaper"],
+)
+def test_theta_moves_only_where_the_model_promises_less(
+    scenario, base, tmp_path, monkeypatch, interpreted, present, back_off, moves
+):
+    """Six more per cent of X2 cost 360 and save nothing; the first three save the penalty."""
+    start = str(tmp_path / "start.toml")
+    base.replace({"x_l": base["x_l"] + [present, 0.0]}).save(start)
+    smaller = {"BURN": 5, "COARSE": 25, "FINE": 60}
+    for name, value in smaller.items():
+        monkeypatch.setattr(model_based, name, value)
+    proposed = np.array([back_off, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(BackOffs, "best", lambda *arguments: proposed)
+    every = {"samples": 40, "log_every": 40, "evaluate_every": 40, "checkpoint_every": 40}
+    settings = {"first_update": 30, "exploration_samples": 1}
+    run = make_run("model-based", scenario, settings, start=start, **every)
+    done = run_training(run)
+    (row,) = done.rows
+    assert (row["updates"], row["refused"]) == (1, 1 - moves)
+    assert np.array_equal(done.parameters.theta, done.start.theta) != moves
+    if moves:
+        assert done.parameters["x_l"][0] == pytest.approx(scenario.state_lower[0] + back_off)
+
+
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch):
     smaller = {"BURN": 5, "COARSE": 25, "FINE": 30, "LEVELS": (0.0, 3.0), "SWEEPS": ((25, (1.2,)),)}
     for name, value in smaller.items():

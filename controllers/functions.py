@@ -199,10 +199,11 @@ BUILDS = Path(__file__).with_name("builds.tar.xz")
 def library(sources: Mapping[str, str | bytes]) -> Path | None:
     """Shared library of C files by name, in the user's cache, made where it is missing.
 
-    Every `*.c` is given to the compiler, the others are included. It is the same file for the same
-    content, compiler and flags, it appears whole, and of several processes one makes it. Without a
-    compiler, or where it fails, it is taken from `BUILDS`. None where it is not there either, and
-    where COSIM_COMPILE says `never`; ControllerError on a word that it does not know.
+    A library of `BUILDS` is taken from there: a compiler needs a minute for the same bytes of
+    results. Of others every `*.c` is given to the compiler, and the other files are included. It is
+    the same file for the same content, compiler and flags, it appears whole, and of several
+    processes one makes it. None where there is no compiler, where it fails, and where COSIM_COMPILE
+    says `never`; ControllerError on a word that it does not know.
     """
     if switch() == "never":
         return None
@@ -218,9 +219,9 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
         if not path.is_file():
             _make(path, files, compiler, stored)
         os.utime(path)
-    except (OSError, KeyError, tarfile.TarError):
+    except OSError:
         return None
-    return path
+    return path if path.is_file() else None
 
 
 def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
@@ -232,17 +233,29 @@ def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
 
 
 def _make(path: Path, files: Mapping[str, bytes], compiler: str | None, stored: str) -> None:
+    """Take a library from `BUILDS`, else compile it; no file where neither can be."""
     with lock(path.with_suffix(".lock"), PATIENCE):
         if path.is_file():
             return
         with temporary_folder(".partial-", path.parent) as folder:
             made = folder / "library"
-            if compiler is None or not _compiled(compiler, files, folder):
-                with tarfile.open(BUILDS) as builds:
-                    build = builds.extractfile(stored)
-                    assert build is not None, "only files are in it"
-                    made.write_bytes(build.read())
+            content = _stored_build(stored)
+            if content is not None:
+                made.write_bytes(content)
+            elif compiler is None or not _compiled(compiler, files, folder):
+                return
             made.replace(path)
+
+
+def _stored_build(name: str) -> bytes | None:
+    """Content of a library of `BUILDS`; None where it is not there."""
+    try:
+        with tarfile.open(BUILDS) as builds:
+            build = builds.extractfile(name)
+            assert build is not None, "only files are in it"
+            return build.read()
+    except (OSError, KeyError, tarfile.TarError, EOFError):
+        return None
 
 
 def _compiled(compiler: str, files: Mapping[str, bytes], folder: Path) -> bool:

@@ -47,6 +47,12 @@ def paper():
 
 
 @pytest.fixture
+def interpreted(monkeypatch):
+    """Controllers are computed by CasADi's interpreter, however long a run is."""
+    monkeypatch.setenv("COSIM_COMPILE", "never")
+
+
+@pytest.fixture
 def rng():
     return np.random.default_rng(20200513)
 

@@ -1,6 +1,7 @@
 """C files compiled into a cache: whole, once, and without an endless wait."""
 
 import ctypes
+import io
 import shutil
 import sys
 import tarfile
@@ -64,16 +65,36 @@ def test_a_stored_build_is_what_its_sources_give():
 
 
 @needs_compiler
-def test_a_stored_build_gives_the_compilers_bytes(folder, monkeypatch):
+def test_a_stored_build_gives_the_compilers_bytes(folder, monkeypatch, tmp_path):
     scenario, tables = Scenario.load("paper"), []
-    for name in (find_compiler(), "no-such-compiler", FAILS):
-        monkeypatch.setenv("CC", name)
+    nowhere = tmp_path / "builds.tar.xz"
+    for compiler, builds in ((find_compiler(), nowhere), ("no-such-compiler", BUILDS)):
+        monkeypatch.setenv("CC", compiler)
+        monkeypatch.setattr(functions, "BUILDS", builds)
         controller = naive(scenario)
         controller.compile()
         assert controller.functions == "compiled"
         with FmuPlant(scenario) as plant:
             tables.append(simulate(plant, controller, 200, seed=1).to_csv())
-    assert tables[0] == tables[1] == tables[2] and len(list(folder.glob("*.lib"))) == 3
+    assert tables[0] == tables[1]
+    assert len(list(folder.glob("*.lib"))) == 2
+
+
+@needs_compiler
+def test_a_stored_build_is_taken_where_there_is_a_compiler_too(folder, monkeypatch, tmp_path):
+    sources = {
+        name: text.encode() for name, text in (SOURCES | {"answer.h": "#define ANSWER 7\n"}).items()
+    }
+    name = build_name(sources, SYSTEMS[present().tuple])
+    builds = tmp_path / "builds.tar.xz"
+    with tarfile.open(builds, "w:xz") as archive:
+        entry = tarfile.TarInfo(name)
+        entry.size = len(b"stored")
+        archive.addfile(entry, io.BytesIO(b"stored"))
+    monkeypatch.setattr(functions, "BUILDS", builds)
+    monkeypatch.setenv("CC", FAILS)
+    assert library(sources).read_bytes() == b"stored"
+    assert answer(8) is None
 
 
 def test_a_compiler_that_fails_or_hangs_leaves_nothing(folder, monkeypatch, tmp_path):

@@ -293,11 +293,11 @@ class Oracle:
         stages = self.stages(theta)
         # z = (v_0, ξ_1, v_1, …, v_{N−1}, ξ_N, t_1, …, t_N)
         size = N * width + N * n
-        P, c = sp.lil_matrix((size, size)), np.zeros(size)
+        P, c = np.zeros((size, size)), np.zeros(size)
         value = s @ block["B_lambda"] @ s + block["b_lambda"] @ s + block["c_lambda"][0]
         outside = np.maximum(np.maximum(drawn.x_lower - s, s - drawn.x_upper), 0)
         value += drawn.w @ outside + drawn.W @ outside**2
-        E, e = sp.lil_matrix((N * n, size)), np.zeros(N * n)
+        E, e = np.zeros((N * n, size)), np.zeros(N * n)
 
         def v_at(k):
             return slice(k * width, k * width + m)
@@ -334,8 +334,8 @@ class Oracle:
         # Rows of G z ≤ h: actions, states, slack.
         G, h = [], []
         for k in range(N):
-            unit_v, unit_x = (sp.lil_matrix((rows, size)) for rows in (m, n))
-            unit_t = sp.lil_matrix((n, size))
+            unit_v, unit_x = (np.zeros((rows, size)) for rows in (m, n))
+            unit_t = np.zeros((n, size))
             unit_v[:, v_at(k)], unit_x[:, x_at(k + 1)] = np.eye(m), np.eye(n)
             unit_t[:, t_at(k + 1)] = np.eye(n)
             if k or a is None:
@@ -344,10 +344,11 @@ class Oracle:
             G += [unit_x - unit_t, -unit_x - unit_t, -unit_t]
             h += [block["x_u"], -block["x_l"], np.zeros(n)]
         if a is not None:
-            fixed = sp.lil_matrix((m, size))
+            fixed = np.zeros((m, size))
             fixed[:, v_at(0)] = np.eye(m)
-            E, e = sp.vstack([E, fixed]), np.concatenate([e, a])
-        P, E, G, h = P.tocsc(), sp.csc_matrix(E), sp.csc_matrix(sp.vstack(G)), np.concatenate(h)
+            E, e = np.vstack([E, fixed]), np.concatenate([e, a])
+        P, E, G = (sp.csc_matrix(matrix) for matrix in (P, E, np.vstack(G)))
+        h = np.concatenate(h)
         z, y, mu = _clarabel(P, c, E, e, G, h)
         z, y, mu, residual, margin = _newton(P, c, E, e, G, h, z, y, mu)
         value += 0.5 * z @ (P @ z) + c @ z

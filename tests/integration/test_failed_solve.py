@@ -151,11 +151,8 @@ def fitted():
 @pytest.mark.parametrize(
     "language", ["Python", pytest.param("C", marks=[needs_compiler, pytest.mark.slow])]
 )
-def test_a_rollout_on_an_empirical_model(problem, fitted, monkeypatch, request, language):
-    if language == "Python":
-        monkeypatch.setenv("COSIM_COMPILE", "never")
-    else:
-        request.getfixturevalue("compiling")
+def test_a_rollout_on_an_empirical_model(problem, fitted, request, language):
+    request.getfixturevalue("interpreted" if language == "Python" else "compiling")
     parameters = Parameters.naive(problem)
     rollout = Rollout(problem, parameters, fitted.features)
     assert (rollout.compiled is not None) == (language == "C")

@@ -152,6 +152,31 @@ def test_samples_that_cost_more_than_was_predicted_call_for_an_update(
         assert rule.state_dict()["data.regime_start"] == 0, "the plant is the same"
 
 
+@pytest.mark.parametrize(
+    ("present", "back_off", "moves"),
+    [(3.0, 9.0, False), (0.0, 3.0, True)],
+    ids=["dearer", "cheaper"],
+)
+def test_theta_moves_only_where_the_model_predicts_less(
+    scenario, tuned_theta, tmp_path, monkeypatch, interpreted, present, back_off, moves
+):
+    """Six more per cent of X2 cost 360 and save nothing; the first three save the penalty."""
+    start = str(tmp_path / "start.toml")
+    tuned_theta.replace({"x_l": tuned_theta["x_l"] + [present, 0.0]}).save(start)
+    proposed = np.array([back_off, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(BackOffOnModel, "best", lambda *arguments: proposed)
+    every = {"samples": 40, "log_every": 40, "evaluate_every": 40, "checkpoint_every": 40}
+    rollouts = {"burn_in": 5, "coarse_rollout": 25, "fine_rollout": 60}
+    settings = {"first_update": 30, "exploration_samples": 1, **rollouts}
+    run = make_run("model-based", scenario, settings, start=start, **every)
+    done = run_training(run)
+    (row,) = done.rows
+    assert (row["updates"], row["refused"]) == (1, 1 - moves)
+    assert np.array_equal(done.parameters.theta, done.start.theta) != moves
+    if moves:
+        assert done.parameters["x_l"][0] == pytest.approx(scenario.state_lower[0] + back_off)
+
+
 SMALLER = {
     "burn_in": 5, "coarse_rollout": 25, "fine_rollout": 30, "back_off_levels": [0.0, 3.0],
     "coarse_factors": [1.2], "fine_factors": [], "finest_factors": [], "first_update": 15,

@@ -18,10 +18,11 @@ from cosim.studies.stored import (
 
 STORED = Path(__file__).parents[3] / "results"
 CHECKED = [name for name, table in stored_studies(STORED).items() if table.check]
+PRINTED = "paper-printed(value_offset=discounted_exploration=additive)"
 TABLES = [
     *(("regression", table) for table in compared_tables(STORED / "regression")),
-    ("quick", "logs/paper-search+q-learning.csv"),
-    ("quick", "trajectories/before-after/paper/naive.csv"),
+    ("learning", f"logs/{PRINTED}.csv"),
+    ("before-after", "trajectories/day/fouled/naive.csv"),
 ]
 """One table of each kind."""
 
@@ -133,12 +134,12 @@ def test_a_number_that_is_gone_and_one_that_is_new_are_differences(twice):
 
 
 def test_another_theta_in_a_kept_file_is_told_by_the_name_of_its_entry(twice):
-    stored, now = twice("quick", "parameters/paper-search+q-learning.toml")
+    stored, now = twice("learning", f"parameters/{PRINTED}.toml")
     (path,) = (now / "parameters").glob("*.toml")
     text = path.read_text()
     number = next(line for line in text.splitlines() if line.startswith("c_lambda"))
     path.write_text(text.replace(number, "c_lambda = 1.0"))
-    (line,) = compared("quick", stored, now)
+    (line,) = compared("learning", stored, now)
     assert f"parameters/{path.name}" in line
     assert "signal theta c_lambda is 1.0 now" in line
 

@@ -70,7 +70,7 @@ def test_every_stored_study_is_a_valid_study_that_can_be_planned():
     assert [name for name, table in studies.items() if table.check] == [
         "closed-loop",
         "gate",
-        "quick",
+        "regression",
     ]
 
 

@@ -31,4 +31,4 @@ class TensorBoard:
 
 
 if __name__ == "__main__":
-    print(train("q-learning", "fouled", 4000, start="commissioned", progress=TensorBoard("runs/q")))
+    print(train("q-learning", "fouled", 4000, start="backed-off", progress=TensorBoard("runs/q")))

@@ -28,13 +28,13 @@ Sample = Callable[[RtiNmpc, Array, np.random.Generator], Transition]
 _searched: dict[tuple[str, str, float, int], Parameters] = {}
 
 
-def commissioned(scenario: Scenario) -> RtiNmpc:
+def backed_off(scenario: Scenario) -> RtiNmpc:
     """RTI-NMPC with the cost tuned by economics, backed off for a guessed noise (`back_off`)."""
     return nmpc(scenario, back_off(tuned(scenario).parameters, scenario))
 
 
 def cautious(scenario: Scenario) -> RtiNmpc:
-    """As `commissioned`, with a reserve back-off of each bound that is not active."""
+    """As `backed_off`, with a reserve back-off of each bound that is not active."""
     start = back_off(tuned(scenario).parameters, scenario)
     return nmpc(scenario, add_reserve(start, scenario))
 

@@ -62,7 +62,7 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
         "which an update is due",
     )
     # what back-offs are possible
-    spare: NonNegative = Field(
+    reserve_back_off: NonNegative = Field(
         18.0,
         description="reserve back-off of a bound that is not active, in standard deviations of the "
         "one-step error; half or none of it where that would cost",
@@ -614,7 +614,7 @@ class BackOffOnModel:
     def _with_reserve(self, delta: Array, i: int) -> Array:
         """δ with as much of the reserve back-off of a bound that is not active as costs nothing."""
         # Half of it, then all: the largest that costs nothing.
-        reserve = self._settings.spare * self.unit[i]
+        reserve = self._settings.reserve_back_off * self.unit[i]
         points = [delta]
         for value in self._rounded(i, [0.5 * reserve, 1.0 * reserve]):
             if value > delta[i]:

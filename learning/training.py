@@ -280,7 +280,7 @@ def train(
         scenario: a scenario, a preset's name or a TOML file.
         samples: plant samples; None: the algorithm's budget, else 50 000.
         seed: seed of noise and exploration.
-        start: where θ starts: naive, tuned, commissioned, cautious or a parameters file.
+        start: where θ starts: naive, tuned, backed-off, cautious or a parameters file.
         settings: hyperparameters by name; the algorithm's Configuration documents them.
         out: folder of the run's checkpoints; None keeps none. `Training.save` writes the rest.
         resume: go on from the checkpoint in `out`.

@@ -31,7 +31,7 @@ from learning.loop import TrainingLoop
 
 DEFAULT_SAMPLES = 50_000
 """Length of a run where neither user nor algorithm states one."""
-STARTS = ("naive", "tuned", "commissioned", "cautious")
+STARTS = ("naive", "tuned", "backed-off", "cautious")
 CARRIERS = ("rti", "converged")
 """Controllers that can carry θ."""
 COUNTS = (
@@ -62,7 +62,7 @@ class TrainingRun:
         divergence: a run has diverged, and ends, where its greedy J exceeds the larger of the naive
             θ's and the start's by more than (divergence − 1) of its magnitude, twice in a row or at
             the end.
-        start: `naive`, `tuned`, `commissioned`, `cautious` or the path of a file of θ.
+        start: `naive`, `tuned`, `backed-off`, `cautious` or the path of a file of θ.
         rest_after: samples after which θ stays and nothing explores; None: never.
 
     Raises:
@@ -120,11 +120,11 @@ class TrainingRun:
     def starting_parameters(self) -> Parameters:
         """θ where the run starts; raises what the function `starting_parameters` raises."""
         problem = Problem.from_scenario(self.scenario)
-        if self.start not in ("commissioned", "cautious"):
+        if self.start not in ("backed-off", "cautious"):
             return starting_parameters(problem, self.configuration, self.start)
         tuned = starting_parameters(problem, self.configuration, "tuned")
         backed_off = back_off(tuned, self.scenario)
-        if self.start == "commissioned":
+        if self.start == "backed-off":
             return backed_off
         return add_reserve(backed_off, self.scenario)
 

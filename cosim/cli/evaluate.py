@@ -32,7 +32,7 @@ def evaluate(
     and scenario.toml, together at the end. Every run is computed anew.
 
     Args:
-        controllers: Comma-separated, or the option again: naive, tuned, commissioned, cautious,
+        controllers: Comma-separated, or the option again: naive, tuned, backed-off, cautious,
             lqr, pi, converged, optimal, a parameters file or module:factory; NAME=… gives one
             another name.
         seeds: Number of seeds.

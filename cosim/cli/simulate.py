@@ -39,7 +39,7 @@ def simulate(
     `ended` why, and the exit code is 2.
 
     Args:
-        controller: naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters
+        controller: naive, tuned, backed-off, cautious, lqr, pi, converged, optimal, a parameters
             file, or module:factory.
     """
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to it.

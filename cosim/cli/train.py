@@ -48,7 +48,7 @@ def train(
         algorithm: A registered one or module:Class.
         samples: Plant samples; default: the algorithm's, or 50 000.
         seed: Seed of noise and exploration.
-        start: Where θ starts: naive, tuned, commissioned, cautious or a parameters file.
+        start: Where θ starts: naive, tuned, backed-off, cautious or a parameters file.
         resume: Go on from the folder's checkpoint.
         overwrite: Begin anew where the folder holds another run.
         assignments: Hyperparameter as name=value; may be repeated.

@@ -40,7 +40,7 @@ DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F", "tuned": "#E69F00", "converged": "#CC79A7", "optimal": "#111111",
     "q-learning": "#0072B2", "batch-q-learning": "#009E73", "actor-critic": "#D55E00",
-    "held": "#999933", "model-based": "#44AA99", "dyna": "#332288",
+    "fixed": "#999933", "model-based": "#44AA99", "dyna": "#332288",
     "offset-free": "#AA4499", "identified": "#117733", "policy-search": "#661100",
     "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9", "learnt": "#56B4E9",
 }  # fmt: skip

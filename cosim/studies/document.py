@@ -85,7 +85,7 @@ class CaseTable(Table):
     samples: Count | list[Count] = 40_000
     """Plant samples of a training."""
     start: Source | list[Source] = "naive"
-    """θ at the start: `naive`, `tuned`, `commissioned`, `cautious` or a parameters file."""
+    """θ at the start: `naive`, `tuned`, `backed-off`, `cautious` or a parameters file."""
     nmpc: Literal["rti", "converged"] | list[Literal["rti", "converged"]] = "rti"
     """NMPC that carries θ: real-time iteration or converged."""
     settings: dict[str, Any] = {}

@@ -14,7 +14,7 @@ def a_simulation(paper, _):
 
 def a_training(paper, _):
     few = {"evaluate_every": 20, "evaluation_seeds": 1, "evaluation_steps": 5, "log_every": 10}
-    train("held", paper, 20, progress=True, **few)
+    train("fixed", paper, 20, progress=True, **few)
 
 
 def an_evaluation(paper, _):

@@ -125,7 +125,7 @@ def test_the_compiled_controller(scenario, problem, expected, compiling, monkeyp
 
 def test_a_training(scenario, problem):
     start = {"seed": SEED, "log_every": SAMPLES, "evaluate_every": SAMPLES}
-    done = train("held", scenario, SAMPLES, evaluation_seeds=1, evaluation_steps=5, **start)
+    done = train("fixed", scenario, SAMPLES, evaluation_seeds=1, evaluation_steps=5, **start)
     rule = Rule(problem, done.start)
     _, _, cost = in_operation(scenario, rule)
     (row,) = done.rows

@@ -23,7 +23,7 @@ def short(tuned, scenario, **settings):
 
 
 def test_the_first_days_theta_is_tuned_and_backed_off_where_the_model_is_active(scenario, tuned):
-    theta = build_controller("commissioned", scenario).parameters
+    theta = build_controller("backed-off", scenario).parameters
     assert 26.0 < theta["x_l"][0] < 30.0
     assert theta["x_u"].tolist() == scenario.state_upper.tolist()
     for name in ("B_l", "b_l", "B_Vf", "b_Vf", "c_f"):
@@ -39,7 +39,7 @@ def test_the_plant_says_nothing_of_it(scenario, tuned):
 
 def test_a_training_starts_with_it(scenario, monkeypatch):
     monkeypatch.setattr(training_run, "back_off", partial(back_off, samples=1000))
-    run = make_run("q-learning", scenario, 1000, start="commissioned")
+    run = make_run("q-learning", scenario, 1000, start="backed-off")
     start = run.starting_parameters()
     assert start["x_l"][0] > 25.0 and "w_sigma" in start.blocks
     assert np.array_equal(start.theta, run.starting_parameters().theta)

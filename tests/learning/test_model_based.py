@@ -33,8 +33,8 @@ def make_search(scenario, problem, tuned_theta, rng):
     model.cost_derivative = lambda inputs: np.zeros(1)
     model.predict = lambda at: (at[:, :3] * [1.0, 1.0, 0.0], np.ones((len(at), 3)), None)
 
-    def make(spare):
-        settings = make_run("model-based", scenario, {"spare": spare}).configuration
+    def make(reserve):
+        settings = make_run("model-based", scenario, {"reserve_back_off": reserve}).configuration
         visited = np.tile([27.0, 60.0, 220.0, 230.0], (settings.recent_samples, 1))
         visited[0, 0] = 20.0
         rollout = riding(problem, tuned_theta)

@@ -206,7 +206,7 @@ def test_the_first_change_counts_the_samples_before_it_and_their_cost_is_the_sta
 def start_in_closed_loop(samples, seed):
     """Costs of θ as it starts, and whether a bound is violated, in a loop of this test's own."""
     scenario = Scenario.load("paper")
-    run = make_run("held", scenario, samples, seed=seed)
+    run = make_run("fixed", scenario, samples, seed=seed)
     controller = nmpc(scenario, run.starting_parameters(), "rti")
     costs, violating = [], []
     with FmuPlant(scenario) as plant:

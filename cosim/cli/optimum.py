@@ -10,7 +10,6 @@ import typer
 
 import cosim
 from cosim.cli import output as cli
-from cosim.scenario import is_file
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming import Optimum, Progress
@@ -36,6 +35,7 @@ def optimum(
     """
     with cli.output(json) as out_:
         from controllers.optimum import QuasiStaticPolicy, change_of
+        from cosim.scenario import is_file
 
         task = cosim.Scenario.load(scenario)
         if is_file(task.plant.fmu):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +15,7 @@ from cosim.protocols import Array, Controller, Plant
 from cosim.simulation import indicators_of
 from cosim.statistics import gap_closed, regret
 from learning.log import METRICS
-
-if TYPE_CHECKING:
-    from learning.training_run import TrainingRun
-
-HELD_OUT = 1_000_000
-"""First of the held-out seeds; training seeds stay below."""
+from learning.training_run import HELD_OUT, TrainingRun
 
 
 class Evaluator:

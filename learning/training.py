@@ -33,10 +33,10 @@ from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
-from learning.evaluator import HELD_OUT, Evaluator
+from learning.evaluator import Evaluator
 from learning.log import COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
-from learning.training_run import TrainingRun, begin, make_run
+from learning.training_run import HELD_OUT, TrainingRun, begin, make_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

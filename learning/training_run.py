@@ -25,12 +25,13 @@ from learning.algorithm import Algorithm, load_algorithm
 from learning.backed_off import add_reserve, back_off
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.evaluator import HELD_OUT
 from learning.exploration import Strategy
 from learning.loop import TrainingLoop
 
 DEFAULT_SAMPLES = 50_000
 """Length of a run where neither user nor algorithm states one."""
+HELD_OUT = 1_000_000
+"""First of the held-out seeds; training seeds stay below."""
 STARTS = ("naive", "tuned", "backed-off", "cautious")
 CARRIERS = ("rti", "converged")
 """Controllers that can carry θ."""

@@ -42,7 +42,7 @@ def demo(
         from cosim.figures.trajectory import overlay_figure
         from cosim.files import staged, temporary_folder
         from cosim.recording import record_overlay, record_training
-        from learning.evaluator import HELD_OUT
+        from learning.training_run import HELD_OUT
 
         scenario = cosim.Scenario.load(SCENARIO)
         folder = cli.open_folder(out)

@@ -34,8 +34,7 @@ from cosim.validation import instead, validated
 from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.evaluator import HELD_OUT
-from learning.training_run import make_run
+from learning.training_run import HELD_OUT, make_run
 
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"

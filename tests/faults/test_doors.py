@@ -116,23 +116,43 @@ def test_a_training_seed_is_no_held_out_one():
         train("q-learning", PAPER, 10, seed=1_000_000)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("state", [None, [], 1, {}, {"rows": 1}, {"rows": [], "row_thetas": []}])
-def test_a_forged_checkpoint(tmp_path, state):
+@pytest.fixture(scope="module")
+def checkpointed(tmp_path_factory):
+    """Give the arguments of a finished training, and its checkpoint."""
+    out = tmp_path_factory.mktemp("training")
     every = {"log_every": 10, "evaluate_every": 10, "checkpoint_every": 10}
     few = {"evaluation_seeds": 1, "evaluation_steps": 2}
-    train("q-learning", PAPER, 10, out=tmp_path, **every, **few)
+    arguments = {"samples": 10, "out": out, **every, **few}
+    train("q-learning", PAPER, **arguments)
+    with np.load(out / "checkpoint.npz") as archive:
+        return arguments, dict(archive)
+
+
+FORGED = {
+    "gone": lambda entry: None,
+    "no number": lambda entry: np.array(float("nan")),
+    "another shape": lambda entry: np.zeros((2, 3, 4)),
+    "empty": lambda entry: np.zeros(0),
+    "bytes": lambda entry: np.frombuffer(b"x", np.uint8),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED.keys())
+@pytest.mark.parametrize("name", ["rows", "row_thetas", "plant", "loop.theta", "loop.rng"])
+def test_a_forged_state_of_a_training(checkpointed, name, forge):
+    arguments, entries = checkpointed
+    forged = {**entries, f"state.{name}": forge(entries[f"state.{name}"])}
+    arrays = {key: array for key, array in forged.items() if array is not None}
+    np.savez(arguments["out"] / "checkpoint.npz", **arrays)
+    assert not accepted(lambda: train("q-learning", PAPER, resume=True, **arguments))
+
+
+@pytest.mark.parametrize("run", [None, [], [[]], 1, "x", {}, {"seed": [1]}, {"a": {"b": 1}}])
+def test_a_forged_run_of_a_checkpoint(tmp_path, run):
     path = tmp_path / "checkpoint.npz"
-    with np.load(path) as archive:
-        arrays = dict(archive)
-    run, _ = json.loads(arrays["run"].tobytes())
-    arrays["run"] = np.frombuffer(json.dumps([run, state]).encode(), np.uint8)
-    np.savez(path, **arrays)
-    again = lambda: train("q-learning", PAPER, 10, out=tmp_path, resume=True, **every, **few)  # noqa: E731
-    assert not accepted(again)
-    arrays["run"] = np.frombuffer(json.dumps(state).encode(), np.uint8)
-    np.savez(path, **arrays)
-    assert not accepted(lambda: checkpoint.load(path, {}))
+    np.savez(path, run=np.frombuffer(json.dumps(run).encode(), np.uint8))
+    assert not accepted(lambda: checkpoint.load(path, {"seed": 0}))
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,9 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from cosim.simulation import indicators_of
-from learning.evaluator import HELD_OUT, Evaluator
+from learning.evaluator import Evaluator
 from learning.log import METRICS
+from learning.training_run import HELD_OUT
 from tests.helpers.training import make_run
 
 

@@ -13,11 +13,10 @@ from cosim.simulation import spawn_seeds
 from learning import QLearning
 from learning.algorithm import Update
 from learning.errors import PrivilegeError
-from learning.evaluator import HELD_OUT
 from learning.exploration import Strategy
 from learning.loop import PlantInOperation, TrainingLoop
 from learning.training import run_training
-from learning.training_run import TrainingRun, begin, starting_parameters
+from learning.training_run import HELD_OUT, TrainingRun, begin, starting_parameters
 
 
 class Idle:

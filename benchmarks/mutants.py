@@ -162,7 +162,7 @@ class Copy:
             raise MutantError(
                 f"pytest said: {' '.join((done.stdout + done.stderr).split())[-300:]}"
             )
-        return failed[0].split()[1]
+        return failed[0].partition(" ")[2].partition(" - ")[0]
 
     def _results_check(self, jobs: int) -> str:
         # Libraries are kept by their content; the key of a solved optimum does not know our code.

@@ -113,9 +113,10 @@ class Copy:
             **os.environ,
             "PYTHONPATH": str(root),
             "PYTHONDONTWRITEBYTECODE": "1",
-            "COSIM_CACHE": str(root.parent / "cache"),
         }
-        self.environment.pop("COSIM_COMPILE", None)
+        # The tests have a cache of their own in each session.
+        for name in ("COSIM_COMPILE", "COSIM_CACHE"):
+            self.environment.pop(name, None)
         where = self.python("-c", "import cosim; print(cosim.__file__)", seconds=120).stdout
         if not where.startswith(str(root)):
             raise MutantError(f"cosim would be imported from {where.strip()}, not from the copy")
@@ -135,10 +136,6 @@ class Copy:
             )
         except subprocess.TimeoutExpired:
             return subprocess.CompletedProcess(command, 124, "", "")
-
-    def forget_what_was_solved(self) -> None:
-        """Delete cached optima: their key does not know the solver's own code."""
-        shutil.rmtree(self.root.parent / "cache" / "optima", ignore_errors=True)
 
     def caught_by(self, stage: str, mutant: Mutant | None, jobs: int) -> str:
         """The test or check that fails in a stage; "" where all pass.
@@ -165,17 +162,23 @@ class Copy:
             raise MutantError(
                 f"pytest said: {' '.join((done.stdout + done.stderr).split())[-300:]}"
             )
-        return failed[0].split()[1]
+        return failed[0].partition(" ")[2].partition(" - ")[0]
 
     def _results_check(self, jobs: int) -> str:
+        # Libraries are kept by their content; the key of a solved optimum does not know our code.
+        cache = self.root.parent / "cache"
+        self.environment["COSIM_CACHE"] = str(cache)
+        shutil.rmtree(cache / "optima", ignore_errors=True)
         command = ["-m", "cosim", "results", "check", "--results", "results", "--json"]
         done = self.python(*command, "--jobs", str(jobs), seconds=SECONDS["check"])
+        del self.environment["COSIM_CACHE"]
         if done.returncode == 0:
             return ""
         if done.returncode == 1:
             try:
                 found = json.loads(done.stdout)["differences"]
-                return "results check: " + next(lines[0] for lines in found.values() if lines)
+                first = next(lines[0] for lines in found.values() if lines)
+                return f"results check: {first}"
             except (ValueError, KeyError, StopIteration):
                 pass
         return f"results check: exit code {done.returncode}"
@@ -197,7 +200,6 @@ def tried(
             sound[key] = copy.caught_by(stage, mutant, jobs)
         if sound[key]:
             raise MutantError(f"without any mutant '{sound[key]}' fails")
-        copy.forget_what_was_solved()
         path.write_text(text, "utf-8")
         try:
             caught = copy.caught_by(stage, mutant, jobs)

@@ -6,6 +6,7 @@ The user's cache is left alone: what tests unpack and solve ends with them.
 import os
 import shutil
 import signal
+import sys
 import tempfile
 from pathlib import Path
 
@@ -46,6 +47,14 @@ if OWN:
 def pytest_unconfigure():
     if OWN:
         shutil.rmtree(os.environ["COSIM_CACHE"], ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def helpers_stay_loaded():
+    """A test in which users' modules are loaded anew leaves those of the tests to the next one."""
+    before = {name: module for name, module in sys.modules.items() if name.startswith("tests.")}
+    yield
+    sys.modules.update(before)
 
 
 @pytest.fixture(scope="session")

@@ -198,7 +198,9 @@ def test_a_run_goes_on_through_solver_failures_and_counts_each(unreliable):
     assert run.status.count("fallback") == failures
 
 
-def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, monkeypatch):
+def test_training_goes_on_through_solver_failures_and_counts_each(
+    unreliable, interpreted, monkeypatch
+):
     monkeypatch.setattr("controllers.rti.nmpc.make_backend", lambda name: unreliable())
     every = {"log_every": 1000, "evaluate_every": 2000, "checkpoint_every": 2000}
     result = run_training(make_run(samples=2000, evaluation_steps=1, **every))

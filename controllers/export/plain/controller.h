@@ -1,7 +1,7 @@
 /* $title
  *
  * Written by `cosim export --format c` of rti-cosim $version (MIT licence). C99, no FMI, no
- * allocation, no files; of libm only sqrt, besides what the model calls.
+ * allocation, no files; of libm only sqrt and copysign, besides what the model calls.
  *
  *     static $Name controller;
  *     ${name}_init(&controller);

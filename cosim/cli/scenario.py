@@ -125,12 +125,28 @@ def init(
         )
         write_atomically(target, text)
         drafted = cosim.Scenario.load(target)
+        if drafted.controller.model is not None:
+            text = _with_enough_substeps(text, drafted)
+            write_atomically(target, text)
+            drafted = cosim.Scenario.load(target)
         if not json:
             print(text, end="")
         if drafted.disturbance.law == "none":
             out_.note(NO_NOISE)
         out_.note(f"written to {target}: read the lines with CHECK")
         out_.json({"file": str(target), **drafted.to_dict(), "hash": drafted.hash})
+
+
+def _with_enough_substeps(text: str, scenario: cosim.Scenario) -> str:
+    """The draft, with more substeps where the model is integrated too coarsely at its bounds."""
+    from controllers.integration import measure_integration
+    from controllers.problem import Problem
+
+    integration = measure_integration(Problem.from_scenario(scenario))
+    if not integration.coarse or integration.suffices is None:
+        return text
+    line = f"substeps = {integration.suffices} # so that the model is accurate at the bounds"
+    return text.replace("[controller]\n", f"[controller]\n{line}\n", 1)
 
 
 def _numbers(text: str, option: str) -> list[float]:

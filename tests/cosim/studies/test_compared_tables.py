@@ -157,3 +157,24 @@ def test_a_column_without_a_tolerance_is_refused(twice):
     write(now / "runs.csv", [*header, "novelty"], [[*row, "1"] for row in rows])
     with pytest.raises(ResultsError, match="novelty"):
         compared("gate", now, now)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "tolerance"),
+    [
+        ("summary.csv", "regret_worst", 1e-5),
+        ("summary.csv", "difference_low", 1e-5),
+        ("runs.csv", "J", 0.05),
+        ("operation.csv", "dearest", 1e-3),
+    ],
+)
+def test_a_number_may_move_by_its_tolerance_and_no_further(twice, table, column, tolerance):
+    stored, now = twice("regression", table)
+    header, rows = read(stored / table)
+    at = header.index(column)
+    row = next(row for row in rows if row[at] and float(row[at]) < 10_000)
+    before = float(row[at])
+    for factor, number in ((0.5, 0), (3.0, 1)):
+        row[at] = repr(before + factor * tolerance)
+        write(now / table, header, rows)
+        assert len(compared("regression", stored, now)) == number

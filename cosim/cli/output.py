@@ -109,7 +109,7 @@ class Output:
 
         if fmu not in SHIPPED:
             # The child that is watched unpacks it, so that a warning about it comes once.
-            watch(f"FMU '{Path(fmu).resolve()}', or other native code,")
+            watch(f"FMU '{Path(fmu).absolute()}', or other native code,")
             found = unpack(fmu)
             self.note(f"native code of {found.path}, sha256 {found.sha256}")
 

@@ -572,7 +572,6 @@ class Instance(ABC):
 
     def _load(self) -> Any:
         library = str(library_path(self.fmu).resolve())
-        library = str(library_path(self.fmu).resolve())
         if self._interface.canBeInstantiatedOnlyOncePerProcess:
             # Its memory is static and keeps what an earlier instance left: a copy has its own.
             with _copy_of(Path(library)) as copy:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -23,7 +23,7 @@ from cosim.files import parse_toml, read_text, write_atomically
 from cosim.protocols import Vector
 from cosim.result import Shown
 from cosim.scenario import Names, Table
-from cosim.validation import instead, validated
+from cosim.validation import SchemaVersion, instead, validated
 
 
 @cache
@@ -192,7 +192,7 @@ class ThetaBlocks:
 
 
 class _File(Table):
-    schema_version: Annotated[Literal[1], Field(alias="schema")]
+    schema_version: Annotated[SchemaVersion, Field(alias="schema")]
     hash: str | None = None
     theta: dict[str, Any]
     model_parameters: Names = ()

@@ -23,7 +23,7 @@ from cosim.errors import ScenarioError
 from cosim.files import read_toml
 from cosim.modules import import_from
 from cosim.result import Shown
-from cosim.validation import suggestion, validated
+from cosim.validation import SchemaVersion, suggestion, validated
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -263,7 +263,7 @@ class Scenario(Shown, Table):
     the FMU's units. Raises ScenarioError with one line that names file, field and allowed values.
     """
 
-    schema_version: Annotated[Literal[1], Field(alias="schema")]
+    schema_version: Annotated[SchemaVersion, Field(alias="schema")]
     """`schema` in the file: 1."""
     name: Name
     """Its name in tables and figures, which does not count in its hash."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 from operator import index
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, ValidationError
 
 Document = TypeVar("Document", bound=BaseModel)
 
@@ -15,6 +15,16 @@ Document = TypeVar("Document", bound=BaseModel)
 _EXPECTED = {"tuple_type": "must be a list"} | dict.fromkeys(
     ("dict_type", "model_type", "model_attributes_type"), "must be a table"
 )
+
+
+def _no_boolean(value: object) -> object:
+    if isinstance(value, bool):
+        raise ValueError("must be 1")
+    return value
+
+
+SchemaVersion = Annotated[Literal[1], BeforeValidator(_no_boolean)]
+"""Version of a document's form; to Python true is 1."""
 
 
 def validated(

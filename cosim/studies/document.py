@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from cosim.errors import StudyError
 from cosim.files import read_toml
 from cosim.scenario import Table
-from cosim.validation import validated
+from cosim.validation import SchemaVersion, validated
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]
@@ -149,7 +149,7 @@ class TrajectoryTable(Table):
 class StudyTable(Table):
     """A study file."""
 
-    schema_version: Annotated[Literal[1], Field(alias="schema")]
+    schema_version: Annotated[SchemaVersion, Field(alias="schema")]
     """`schema` in the file: 1."""
     name: Name
     """The study's name in tables and messages."""

@@ -152,8 +152,9 @@ def make_run(
     Args:
         samples: None: the algorithm's budget, else 50 000.
         settings: hyperparameters by name, or all of them.
-        log_every, evaluate_every, checkpoint_every: where not given, near their defaults and so
-            that they fit the others.
+        log_every: where an interval is not given, it is near its default and fits the others.
+        evaluate_every: likewise.
+        checkpoint_every: likewise.
 
     Raises:
         AlgorithmLookupError: there is no such algorithm.

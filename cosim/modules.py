@@ -56,8 +56,14 @@ def import_folders() -> tuple[str, ...]:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Let import statements find modules of `import_folders`, after all others."""
+    """Let import statements find modules of `import_folders`, after all others.
+
+    No bytecode is written meanwhile: Python takes it for current where the source has the same
+    size and was changed in the same second, and would run the code from before an edit.
+    """
     with _lock:
+        written = sys.dont_write_bytecode
+        sys.dont_write_bytecode = True
         added = [folder for folder in import_folders() if folder not in sys.path]
         for package in OURS:  # a folder of such a name would be found before an editable install
             names = [Path(folder) / f"{package}{end}" for folder in added for end in ("", ".py")]
@@ -68,6 +74,7 @@ def importing() -> Iterator[None]:
         try:
             yield
         finally:
+            sys.dont_write_bytecode = written
             for folder in added:
                 with suppress(ValueError):
                     sys.path.remove(folder)

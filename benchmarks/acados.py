@@ -160,7 +160,7 @@ def solver(scenario, theta):
 
 def worker(name):
     """Answer each line `alone` or `differentiated` by the seconds of a pass over the states."""
-    from cosim.scenario import Scenario
+    from cosim.core.scenario import Scenario
 
     with os.fdopen(os.dup(1), "w") as answers:
         os.dup2(2, 1)  # acados and make print

@@ -13,8 +13,8 @@ from unittest.mock import patch
 
 from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks
 from controllers.functions import BUILDS, LONG, build_name
-from cosim.files import replacing
-from cosim.scenario import Scenario, presets
+from cosim.core.files import replacing
+from cosim.core.scenario import Scenario, presets
 from fmus import PLATFORMS, Platform
 from fmus.build import cross_compiler
 from learning.empirical_model import Features

@@ -18,11 +18,11 @@ from controllers import OptimalPolicy
 from controllers import optimum as store
 from controllers.dynamic_programming import SEARCH, Figure, Settings, objection
 from controllers.problem import PlantProblem
+from cosim.core.plugins import build_controller
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import indicators_of
+from cosim.core.statistics import mean
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller
-from cosim.scenario import Scenario
-from cosim.simulation import indicators_of
-from cosim.statistics import mean
 
 SEEDS, STEPS = range(900_000, 900_010), 10_000
 

@@ -17,7 +17,7 @@ from controllers import Problem, RtiNmpc, compile_functions
 from controllers.factories import naive
 from controllers.qp import DaqpBackend, qpsolvers_problem
 from cosim import FmuPlant
-from cosim.simulation import spawn_seeds
+from cosim.core.simulation import spawn_seeds
 
 SAMPLE, Q_SAMPLE = "prepare + feedback + dV/dθ", "V(s₊), Q(s, a) and dQ/dθ"
 INTERPRETER = "interpreter"

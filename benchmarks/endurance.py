@@ -22,7 +22,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from cosim import Scenario
-from cosim.plugins import build_controller
+from cosim.core.plugins import build_controller
 from learning.q_learning import QLearning
 from learning.training import run_training
 from learning.training_run import TrainingRun

@@ -11,8 +11,8 @@ from benchmarks.measuring import clock, figure
 from controllers import compile_functions
 from cosim import FmuPlant
 from cosim.cli.controller_fmu import rti_controller, write_fmu
-from cosim.files import temporary_folder
-from cosim.simulation import spawn_seeds
+from cosim.core.files import temporary_folder
+from cosim.core.simulation import spawn_seeds
 
 TARGET, WARM_UP = 30.0, 20
 

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 import cosim
-from cosim.modules import OURS, ROOT
+from cosim.core.modules import OURS, ROOT
 
 
 class Entered:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from cosim import Scenario
 from cosim.cli.controller_fmu import rti_controller, write_c
-from cosim.result import markdown_table
+from cosim.core.result import markdown_table
 
 PROCESSORS = {
     "Cortex-M7, double-precision FPU": ("thumb-linux-musleabihf", "-mcpu=cortex_m7+fp_armv8d16"),

@@ -19,11 +19,11 @@ import fmpy
 import numpy as np
 
 from cosim import FmuPlant, Scenario
-from cosim.errors import CosimError
+from cosim.core.errors import CosimError
+from cosim.core.result import markdown_table
 from cosim.plant.draft import action_limits, elements, start_value
 from cosim.plant.fmi import number, unpack
 from cosim.plant.wiring import refusals
-from cosim.result import markdown_table
 
 SAMPLES, STEP = 20, 0.125  # fmpy's sums of this step are exact
 TIMEOUT = 300.0  # s for one FMU

@@ -19,11 +19,11 @@ import numpy as np
 from controllers import compile_functions
 from controllers.factories import nmpc, optimal
 from controllers.optimum import stored_optimum
+from cosim.core.protocols import Controller
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import simulate
+from cosim.core.statistics import regrets
 from cosim.plant import FmuPlant
-from cosim.protocols import Controller
-from cosim.scenario import Scenario
-from cosim.simulation import simulate
-from cosim.statistics import regrets
 from learning.model_based import ModelBased
 from learning.training_run import TrainingRun, begin, make_run
 

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.importers import check
-from cosim.result import markdown_table
+from cosim.core.result import markdown_table
 from fmus import PLATFORMS
 from fmus.model import FmiVersion
 from tests.helpers.platforms import (

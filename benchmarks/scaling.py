@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.measuring import clock, figure
 from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks, compile_functions
-from cosim.simulation import spawn_seeds
+from cosim.core.simulation import spawn_seeds
 
 HORIZONS, SAMPLES, REPETITIONS = (5, 10, 20, 40, 80), 20, 5
 PHASES = ("prepare", "feedback", "dV/dθ", "dπ/dθ")

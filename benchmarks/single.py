@@ -16,7 +16,7 @@ import numpy as np
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario, simulate
 from cosim.cli.controller_fmu import rti_controller, write_c
-from cosim.result import markdown_table
+from cosim.core.result import markdown_table
 
 
 def actions_and_status(folder, states):

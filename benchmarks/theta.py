@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.result import markdown_table
-from cosim.statistics import mean, shown
+from cosim.core.result import markdown_table
+from cosim.core.statistics import mean, shown
 from cosim.studies.plan import Plan, Study, plan
 from cosim.studies.results import StudyResults
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from controllers.factories import nmpc, tuned
 from cosim import FmuPlant, Scenario
-from cosim.simulation import simulate
+from cosim.core.simulation import simulate
 
 FIRST_SEED = 900_000
 BURN_IN = 500

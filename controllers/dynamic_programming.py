@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from controllers.errors import ModelError, OptimumError
 from controllers.model import discretise, economic_cost
 from controllers.problem import DisturbanceLaw, PlantProblem, Problem
-from cosim.protocols import Array
+from cosim.core.protocols import Array
 
 # A stored optimum is read without SciPy, which takes longer to load than the optimum.
 if TYPE_CHECKING:

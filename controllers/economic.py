@@ -18,7 +18,7 @@ from controllers.errors import TuningError
 from controllers.model import discretise, runge_kutta
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
-from cosim.protocols import Array
+from cosim.core.protocols import Array
 
 # A bound counts as strictly active above this share of the largest multiplier.
 _STRICT = 1e-6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import Any, ClassVar
 
-from cosim.errors import CosimError, CosimWarning
+from cosim.core.errors import CosimError, CosimWarning
 
 
 class ControllerError(CosimError):

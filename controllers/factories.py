@@ -13,7 +13,7 @@ from controllers.errors import ControllerError
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.scenario import Scenario
+from cosim.core.scenario import Scenario
 
 if TYPE_CHECKING:
     from controllers.linear import Lqr, PiLoops

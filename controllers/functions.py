@@ -17,9 +17,9 @@ import casadi as ca
 import numpy as np
 
 from controllers.errors import ControllerError
-from cosim.files import cache_folder, lock, temporary_folder
-from cosim.processes import child_process
-from cosim.protocols import Matrix, Vector
+from cosim.core.files import cache_folder, lock, temporary_folder
+from cosim.core.processes import child_process
+from cosim.core.protocols import Matrix, Vector
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 

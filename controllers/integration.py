@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from controllers.errors import ModelError, ModelWarning, warn
 from controllers.problem import Problem
-from cosim.protocols import Matrix
+from cosim.core.protocols import Matrix
 
 Mask = NDArray[np.bool_]
 

@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from controllers.economic import linear_model, local_feedback, tune
 from controllers.errors import ControllerError
 from controllers.problem import Problem
-from cosim.protocols import Array, Decision
+from cosim.core.protocols import Array, Decision
 
 
 class Lqr:

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from controllers.errors import ModelError
-from cosim.modules import exception_line
+from cosim.core.modules import exception_line
 
 REMEDIES = (
     (

@@ -31,9 +31,9 @@ from controllers.dynamic_programming import (
 from controllers.errors import ModelError, OptimumError, QpError
 from controllers.model import Model
 from controllers.problem import VECTORS, PlantProblem, load_model
-from cosim.files import cache_folder, read_arrays, write_atomically
-from cosim.protocols import Decision, Vector
-from cosim.scenario import Scenario, is_file
+from cosim.core.files import cache_folder, read_arrays, write_atomically
+from cosim.core.protocols import Decision, Vector
+from cosim.core.scenario import Scenario, is_file
 
 VERSION = 2
 """Part of every key; to be raised when the solver's results change."""

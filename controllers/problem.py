@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ModelError, OptimumError
 from controllers.model import Model
 from controllers.qp import FIXED, MEANING, SETTINGS
-from cosim.modules import exception_line, load_plugin
-from cosim.protocols import Matrix, Vector
-from cosim.scenario import Penalty, Scenario
+from cosim.core.modules import exception_line, load_plugin
+from cosim.core.protocols import Matrix, Vector
+from cosim.core.scenario import Penalty, Scenario
 
 Mask = NDArray[np.bool_]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ControllerError, QpError
-from cosim.protocols import Matrix, Vector
+from cosim.core.protocols import Matrix, Vector
 
 if TYPE_CHECKING:
     import qpsolvers

@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 
 from controllers.functions import StackedFunction
+from controllers.preparation import stage_parameter_gradient
 from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
-from controllers.rti.preparation import stage_parameter_gradient
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
-from cosim.protocols import Matrix
+from cosim.core.protocols import Matrix
 
 SOLUTION = ("xi", "t", "chi", "v", "lam")
 """First inputs of the sensitivities: a solution's parts."""

@@ -19,11 +19,11 @@ from pydantic import Field
 from controllers.errors import ModelError, ParameterError
 from controllers.functions import consecutive
 from controllers.problem import Problem
-from cosim.files import parse_toml, read_text, write_atomically
-from cosim.protocols import Vector
-from cosim.result import Shown
-from cosim.scenario import Names, Table
-from cosim.validation import SchemaVersion, instead, validated
+from cosim.core.files import parse_toml, read_text, write_atomically
+from cosim.core.protocols import Vector
+from cosim.core.result import Shown
+from cosim.core.scenario import Names, Table
+from cosim.core.validation import SchemaVersion, instead, validated
 
 
 @cache

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 import lazy_loader
 
 if TYPE_CHECKING:
+    from cosim.core.plugins import build_controller as build_controller
+    from cosim.core.protocols import Decision as Decision
+    from cosim.core.scenario import Scenario as Scenario
+    from cosim.core.simulation import simulate as simulate
+    from cosim.core.trajectory import Trajectory as Trajectory
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
     from cosim.plant import FmuPlant as FmuPlant
-    from cosim.plugins import build_controller as build_controller
-    from cosim.protocols import Decision as Decision
-    from cosim.scenario import Scenario as Scenario
-    from cosim.simulation import simulate as simulate
     from cosim.studies.plan import Study as Study
     from cosim.studies.results import StudyResults as StudyResults
     from cosim.studies.results import study as study
     from cosim.training import Parameters as Parameters
     from cosim.training import Training as Training
     from cosim.training import train as train
-    from cosim.trajectory import Trajectory as Trajectory
 
     __version__: str
 
@@ -31,14 +31,14 @@ _attribute, _names, __all__ = lazy_loader.attach(
     submod_attrs={
         "evaluation": ["Evaluation", "evaluate"],
         "plant": ["FmuPlant"],
-        "plugins": ["build_controller"],
-        "protocols": ["Decision"],
-        "scenario": ["Scenario"],
-        "simulation": ["simulate"],
+        "core.plugins": ["build_controller"],
+        "core.protocols": ["Decision"],
+        "core.scenario": ["Scenario"],
+        "core.simulation": ["simulate"],
         "studies.plan": ["Study"],
         "studies.results": ["StudyResults", "study"],
         "training": ["Parameters", "Training", "train"],
-        "trajectory": ["Trajectory"],
+        "core.trajectory": ["Trajectory"],
     },
 )
 

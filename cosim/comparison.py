@@ -11,38 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from cosim.errors import ComparisonError, ScenarioError
-from cosim.protocols import Array
-from cosim.scenario import Scenario
-from cosim.trajectory import Signal, clocked, read_signals
-from cosim.validation import instead
+from cosim.core.errors import ComparisonError, ScenarioError
+from cosim.core.protocols import Array
+from cosim.core.scenario import Scenario
+from cosim.core.trajectory import RunSignals, Signal, clocked, read_signals
+from cosim.core.validation import instead
 
 # The residual is itself a rounding error: a share of it is no tolerance.
 _ERROR = "residual"
-
-
-@dataclass(frozen=True)
-class RunSignals:
-    """A run's `signals` by name, all of K samples, and the status of each ([] if not known).
-
-    `name` is its path; `bounds` are (lower, upper) of signals with known bounds; `ordered` says
-    that the order of the signals is that of a file's columns.
-    """
-
-    name: str
-    signals: Mapping[str, Signal]
-    status: Sequence[str] = ()
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    ordered: bool = True
-
-    @property
-    def label(self) -> str:
-        """The run's folder, or the file where its name says more than `trajectory` or `run`."""
-        path = Path(self.name)
-        return path.parent.name or path.stem if path.stem in ("trajectory", "run") else path.stem
-
-    def __len__(self) -> int:
-        return max((len(signal.values) for signal in self.signals.values()), default=0)
 
 
 def load_run(path: str | Path) -> RunSignals:

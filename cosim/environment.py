@@ -15,11 +15,11 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
+from cosim.core.protocols import Array
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import spawn_seeds
 from cosim.plant import FmuPlant
-from cosim.protocols import Array
-from cosim.scenario import Scenario
-from cosim.simulation import spawn_seeds
 
 Single = NDArray[np.float32]
 SHARE = 0.1

@@ -15,18 +15,18 @@ import numpy as np
 import pandas as pd
 
 from controllers.optimum import stored_optimum
-from cosim import statistics
-from cosim.errors import EvaluationError
-from cosim.files import staged
+from cosim.core import statistics
+from cosim.core.errors import EvaluationError
+from cosim.core.files import staged
+from cosim.core.plugins import ControllerSource, build_controller, parameters_hash
+from cosim.core.processes import holding
+from cosim.core.protocols import Array, Decision
+from cosim.core.result import Result, markdown_table
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import indicators, measure, reporting, simulate
+from cosim.core.validation import instead, whole_number
 from cosim.measurement import Factory, Measured, MeasureItem, Noise, built
 from cosim.plant import FmuPlant
-from cosim.plugins import ControllerSource, build_controller, parameters_hash
-from cosim.processes import holding
-from cosim.protocols import Array, Decision
-from cosim.result import Result, markdown_table
-from cosim.scenario import Scenario
-from cosim.simulation import indicators, measure, reporting, simulate
-from cosim.validation import instead, whole_number
 from cosim.workers import Conditions, Failure, done
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def evaluate(
     Args:
         scenario: a scenario, a preset's name or a TOML file.
         controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
-            what `cosim.plugins.build_controller` takes; or only such texts, or `NAME=…`. The
+            what `cosim.core.plugins.build_controller` takes; or only such texts, or `NAME=…`. The
             one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
         seeds: the seeds, or their number S for 0 … S−1.
         steps: samples per run, from the scenario's initial state on.

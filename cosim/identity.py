@@ -11,11 +11,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from cosim.errors import ControllerLookupError
-from cosim.modules import OURS, ROOT, TARGET, code_of, forget_users_modules, load_plugin
+from cosim.core.errors import ControllerLookupError
+from cosim.core.modules import OURS, ROOT, TARGET, code_of, forget_users_modules, load_plugin
+from cosim.core.plugins import ALGORITHMS, CONTROLLERS, registered
+from cosim.core.scenario import Scenario
 from cosim.plant.fmi import unpack
-from cosim.plugins import ALGORITHMS, CONTROLLERS, registered
-from cosim.scenario import Scenario
 
 DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
 SUFFIXES = (".py", ".toml", ".fmu", ".npz", ".c", ".h", ".in")
@@ -31,7 +31,7 @@ def depends_on(
 ) -> dict[str, str]:
     """All that a result depends on, by name: versions as text, everything else as hashes.
 
-    Plug-ins are taken as this process has loaded them, see `cosim.modules.code_of`.
+    Plug-ins are taken as this process has loaded them, see `cosim.core.modules.code_of`.
 
     Args:
         scenario: the scenario; its FMU and its models count, too.
@@ -39,7 +39,8 @@ def depends_on(
         files: data files by their names in the answer.
 
     Returns:
-        Words that are equal where the thing is; `cosim.modules.UNKNOWN` where that cannot be known.
+        Words that are equal where the thing is; `cosim.core.modules.UNKNOWN` where that cannot
+            be known.
 
     Raises:
         ControllerLookupError: a part cannot be imported.

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controllers import compile_functions
+from cosim.core.plugins import ControllerSource
+from cosim.core.protocols import Controller
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import measure, simulate
 from cosim.plant import FmuPlant
-from cosim.plugins import ControllerSource
-from cosim.protocols import Controller
-from cosim.scenario import Scenario
-from cosim.simulation import measure, simulate
 from cosim.workers import Item
 
 ITEM = 20_000

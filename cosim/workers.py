@@ -18,12 +18,12 @@ from typing import Any, Generic, Self, TypeVar
 
 import loky
 
-from cosim.errors import EvaluationError
+from cosim.core.errors import EvaluationError
+from cosim.core.modules import OURS, import_folders, import_from
+from cosim.core.processes import Terminated, follow_parent, without_interrupts
+from cosim.core.scenario import Scenario, is_file
+from cosim.core.validation import whole_number
 from cosim.identity import changed, depends_on
-from cosim.modules import OURS, import_folders, import_from
-from cosim.processes import Terminated, follow_parent, without_interrupts
-from cosim.scenario import Scenario, is_file
-from cosim.validation import whole_number
 
 ANSWER_SECONDS = 10.0
 """Time in which a scheduler answers."""

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
-from cosim.protocols import Matrix, Vector
+from cosim.core.protocols import Matrix, Vector
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, Positive

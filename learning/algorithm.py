@@ -10,11 +10,11 @@ from typing import Any, ClassVar, Literal, NamedTuple, get_args
 import numpy as np
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
-from cosim.modules import load_plugin
-from cosim.plugins import ALGORITHMS, registered
-from cosim.protocols import Vector
-from cosim.scenario import Scenario
-from cosim.validation import suggestion
+from cosim.core.modules import load_plugin
+from cosim.core.plugins import ALGORITHMS, registered
+from cosim.core.protocols import Vector
+from cosim.core.scenario import Scenario
+from cosim.core.validation import suggestion
 from learning.checkpoint import State
 from learning.configuration import Configuration
 from learning.errors import AlgorithmLookupError

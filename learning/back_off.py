@@ -12,8 +12,8 @@ from pydantic import Field
 
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.protocols import Matrix, Vector
-from cosim.scenario import Scenario
+from cosim.core.protocols import Matrix, Vector
+from cosim.core.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, GreedyConfiguration, Positive, Share

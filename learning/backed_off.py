@@ -16,9 +16,9 @@ from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.protocols import Array
-from cosim.scenario import Scenario
-from cosim.simulation import recover
+from cosim.core.protocols import Array
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import recover
 from learning.algorithm import Transition
 from learning.back_off import BackOffConfiguration, BackOffSearch
 from learning.prediction_errors import OneStepModel

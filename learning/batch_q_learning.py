@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from controllers.errors import QpError
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
-from cosim.protocols import Matrix, Vector
+from cosim.core.protocols import Matrix, Vector
 from learning.algorithm import Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Count

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.files import read_arrays, write_atomically
+from cosim.core.files import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
 State = dict[str, Any]

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from controllers.model import Model
-from cosim.scenario import Scenario
-from cosim.validation import validated
+from cosim.core.scenario import Scenario
+from cosim.core.validation import validated
 from learning.errors import ConfigurationError
 
 ALL = ("all",)

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from controllers.problem import Problem
-from cosim.protocols import Array, Step
-from cosim.scenario import Scenario
+from cosim.core.protocols import Array, Step
+from cosim.core.scenario import Scenario
 from learning.algorithm import Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Count

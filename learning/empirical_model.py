@@ -25,7 +25,7 @@ from pydantic import Field
 from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
-from cosim.protocols import Array
+from cosim.core.protocols import Array
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, NonNegative, Positive, Share
 

@@ -1,6 +1,6 @@
 """Errors of the learning package; each message names the mistake and its place."""
 
-from cosim.errors import CosimError
+from cosim.core.errors import CosimError
 
 
 class LearningError(CosimError):

@@ -11,9 +11,9 @@ from controllers import compile_functions
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.protocols import Array, Controller, Plant
-from cosim.simulation import indicators_of
-from cosim.statistics import gap_closed, regret
+from cosim.core.protocols import Array, Controller, Plant
+from cosim.core.simulation import indicators_of
+from cosim.core.statistics import gap_closed, regret
 from learning.log import METRICS
 from learning.training_run import HELD_OUT, TrainingRun
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from cosim.protocols import Matrix, Vector
-from cosim.scenario import Scenario
+from cosim.core.protocols import Matrix, Vector
+from cosim.core.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 

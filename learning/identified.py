@@ -14,7 +14,7 @@ from controllers.errors import TuningError
 from controllers.model import Model
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.protocols import Matrix, Vector
+from cosim.core.protocols import Matrix, Vector
 from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off import DEFAULT_BUDGET, backed_off_by_errors
 from learning.checkpoint import State

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite, isnan
 
 from controllers.theta import Parameters
-from cosim.result import csv_text
+from cosim.core.result import csv_text
 
 METRICS = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
 """What an evaluation says of a greedy policy, means over its runs (failures: their sum)."""

@@ -11,10 +11,10 @@ import numpy as np
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
+from cosim.core.protocols import Plant, Step, Vector
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import recover
 from cosim.plant import FmuPlant
-from cosim.protocols import Plant, Step, Vector
-from cosim.scenario import Scenario
-from cosim.simulation import recover
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
 from learning.errors import PrivilegeError

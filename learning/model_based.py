@@ -21,7 +21,7 @@ from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.protocols import Array
+from cosim.core.protocols import Array
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import (

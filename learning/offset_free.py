@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from controllers.theta import Parameters
-from cosim.protocols import Vector
+from cosim.core.protocols import Vector
 from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off import DEFAULT_BUDGET, backed_off_by_errors
 from learning.checkpoint import State, part_of, prefixed

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
-from cosim.protocols import Array
+from cosim.core.protocols import Array
 from learning.algorithm import Transition
 from learning.checkpoint import State, part_of, prefixed
 from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features

@@ -10,8 +10,8 @@ from pydantic import Field
 from scipy.linalg import expm
 
 from controllers.theta import Parameters
-from cosim.protocols import Vector
-from cosim.scenario import Scenario
+from cosim.core.protocols import Vector
+from cosim.core.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, GreedyConfiguration, Positive

@@ -12,8 +12,8 @@ from controllers.functions import StackedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.protocols import Matrix, Vector
-from cosim.scenario import Penalty, Scenario
+from cosim.core.protocols import Matrix, Vector
+from cosim.core.scenario import Penalty, Scenario
 from learning.checkpoint import State
 
 LONGEST_TIME_CONSTANT = 1000.0

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from controllers.theta import Parameters
-from cosim.protocols import Matrix, Vector
-from cosim.scenario import Scenario
+from cosim.core.protocols import Matrix, Vector
+from cosim.core.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import (

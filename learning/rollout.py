@@ -16,8 +16,8 @@ from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.protocols import Array
-from cosim.simulation import recover
+from cosim.core.protocols import Array
+from cosim.core.simulation import recover
 from learning.empirical_model import EmpiricalModel, Features, c_definitions, pointers
 
 

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 from controllers.economic import solve_conic, svec_order
 from controllers.rti import RtiNmpc
 from controllers.theta import ThetaBlocks
-from cosim.protocols import Matrix, Vector
+from cosim.core.protocols import Matrix, Vector
 from learning.algorithm import Update
 from learning.checkpoint import State
 from learning.configuration import Configuration

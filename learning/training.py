@@ -19,15 +19,15 @@ from controllers.factories import nmpc
 from controllers.optimum import stored_optimum
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.errors import CapabilityError
-from cosim.files import check_target, staged, write_atomically
+from cosim.core.errors import CapabilityError
+from cosim.core.files import check_target, staged, write_atomically
+from cosim.core.plugins import build_controller
+from cosim.core.protocols import Array
+from cosim.core.result import Result
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import functions_of, reporting, simulate
+from cosim.core.statistics import shown
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller
-from cosim.protocols import Array
-from cosim.result import Result
-from cosim.scenario import Scenario
-from cosim.simulation import functions_of, reporting, simulate
-from cosim.statistics import shown
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import State, part_of, prefixed

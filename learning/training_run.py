@@ -16,11 +16,11 @@ from controllers.economic import tune
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import spawn_seeds
+from cosim.core.validation import suggestion
 from cosim.identity import depends_on
 from cosim.plant import FmuPlant
-from cosim.scenario import Scenario
-from cosim.simulation import spawn_seeds
-from cosim.validation import suggestion
 from learning.algorithm import Algorithm, load_algorithm
 from learning.backed_off import add_reserve, back_off
 from learning.configuration import Configuration

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
 from controllers.functions import c_source, not_in_c, work_sizes
+from controllers.preparation import RESIDUAL, Exact, SampleFunctions
 from controllers.problem import Problem
-from controllers.rti.preparation import RESIDUAL, Exact, SampleFunctions
 from controllers.theta import Parameters
-from cosim.scenario import Scenario
+from cosim.core.scenario import Scenario
 
 SOURCES = Path(__file__).parent / "sources"
 QP_SOURCES = ("qp.h", "qp_enter.h", "qp_refine.h", "qp_residual.h", "qp_set.h")

@@ -23,6 +23,7 @@ from controllers.export.core import (
     why_not_in_c,
 )
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
+from controllers.preparation import RESIDUAL, Exact, SampleFunctions, Spectrum
 from controllers.problem import Problem
 from controllers.qp import (
     QpBackend,
@@ -32,7 +33,6 @@ from controllers.qp import (
     multipliers_at_kink,
     polish,
 )
-from controllers.rti.preparation import RESIDUAL, Exact, SampleFunctions, Spectrum
 from controllers.sensitivities import (
     SOLUTION,
     adjoint_directions,
@@ -40,8 +40,8 @@ from controllers.sensitivities import (
     sensitivities,
 )
 from controllers.theta import Parameters
-from cosim.protocols import CompiledLoop, Matrix, Vector
-from cosim.scenario import Scenario
+from cosim.core.protocols import CompiledLoop, Matrix, Vector
+from cosim.core.scenario import Scenario
 
 
 class LinearisationPoint(NamedTuple):

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from cosim.cli.output import JsonOption, output
-from cosim.errors import ComparisonError
-from cosim.files import protect
+from cosim.core.errors import ComparisonError
+from cosim.core.files import protect
 
 
 def compare(

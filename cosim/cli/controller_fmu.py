@@ -12,13 +12,13 @@ from typing import Any
 from controllers import Parameters, RtiNmpc
 from controllers.export import STATUSES, core, plain_c
 from controllers.theta import ThetaBlocks
-from cosim.errors import ControllerLookupError
-from cosim.files import write_atomically
+from cosim.core.errors import ControllerLookupError
+from cosim.core.files import write_atomically
+from cosim.core.plugins import build_controller
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import spawn_seeds
 from cosim.plant.fmi import unpack
 from cosim.plant.wiring import start_values
-from cosim.plugins import build_controller
-from cosim.scenario import Scenario
-from cosim.simulation import spawn_seeds
 from fmus.build import build_model, sampled_table
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
 from fmus.ssp import write_ssp

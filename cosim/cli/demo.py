@@ -37,10 +37,10 @@ def demo(
     """
     with cli.output(json) as out_:
         from cosim.cli.evaluate import show
-        from cosim.comparison import RunSignals
+        from cosim.core.files import staged, temporary_folder
+        from cosim.core.trajectory import RunSignals
         from cosim.figures.style import save
         from cosim.figures.trajectory import overlay_figure
-        from cosim.files import staged, temporary_folder
         from cosim.recording import record_overlay, record_training
         from learning.training_run import HELD_OUT
 

@@ -11,7 +11,7 @@ import typer
 
 import cosim
 from cosim.cli import output as cli
-from cosim.files import staged, write_atomically
+from cosim.core.files import staged, write_atomically
 
 
 def evaluate(
@@ -75,8 +75,8 @@ def evaluate(
 
 
 def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
+    from cosim.core.statistics import mean, regret, shown
     from cosim.evaluation import FILES, judge
-    from cosim.statistics import mean, regret, shown
 
     table = judge(scenario, trajectories)
     cost, optimum = table["J"].to_numpy(), table["optimum"].to_numpy()
@@ -101,7 +101,7 @@ def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: c
 
 def show(summary: dict[str, Any], output: cli.Output) -> None:
     """Print the table of controllers and the paired comparisons."""
-    from cosim.statistics import shown
+    from cosim.core.statistics import shown
 
     found, timing = summary["controllers"], summary["timing"]
     columns = {
@@ -144,7 +144,7 @@ def show(summary: dict[str, Any], output: cli.Output) -> None:
 
 def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:
     """An estimate of a summary with its interval; empty where it is undefined."""
-    from cosim.statistics import shown
+    from cosim.core.statistics import shown
 
     if estimate is None or not isfinite(estimate["value"]):
         return ""

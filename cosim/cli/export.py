@@ -44,8 +44,8 @@ def export(
         from importlib.util import find_spec
 
         from cosim.cli import controller_fmu
-        from cosim.errors import CosimError
-        from cosim.files import check_target
+        from cosim.core.errors import CosimError
+        from cosim.core.files import check_target
         from fmus import PLATFORMS, present
         from fmus.model import FmiVersion
 

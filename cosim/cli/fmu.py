@@ -30,7 +30,7 @@ def _path(name: str) -> Path:
 def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
     with output(json) as out_:
-        from cosim.errors import PlantError
+        from cosim.core.errors import PlantError
         from cosim.plant.fmi import unpack
         from cosim.plant.wiring import refusals
         from fmus.check import information
@@ -84,10 +84,10 @@ def check(
         sampling_time: Sampling time in s.
     """
     with output(json) as out_:
-        from cosim.errors import FmuWarning, PlantError
+        from cosim.core.errors import FmuWarning, PlantError
+        from cosim.core.processes import watch
         from cosim.plant.check import PlantCheck, check_plant
         from cosim.plant.fmi import SHIPPED
-        from cosim.processes import watch
 
         path = Path(file).absolute()
         try:

@@ -29,9 +29,9 @@ from cosim.cli import (
     train,
     view,
 )
-from cosim.errors import CosimError, CosimWarning
-from cosim.files import protect
-from cosim.processes import Finished, Interrupted, Terminated, command_process, unwound
+from cosim.core.errors import CosimError, CosimWarning
+from cosim.core.files import protect
+from cosim.core.processes import Finished, Interrupted, Terminated, command_process, unwound
 
 OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
 """Options whose value is an output path."""

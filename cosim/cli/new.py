@@ -41,8 +41,8 @@ def new(
         from keyword import iskeyword
         from shlex import quote
 
-        from cosim.errors import CosimError
-        from cosim.files import write_atomically
+        from cosim.core.errors import CosimError
+        from cosim.core.files import write_atomically
 
         if not re.fullmatch(r"[a-z]\w*", name, re.ASCII | re.IGNORECASE) or iskeyword(name):
             raise CosimError(f"'{name}' is no name of a module: letters, digits and _, no keyword")

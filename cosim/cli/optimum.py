@@ -35,7 +35,7 @@ def optimum(
     """
     with cli.output(json) as out_:
         from controllers.optimum import QuasiStaticPolicy, change_of
-        from cosim.scenario import is_file
+        from cosim.core.scenario import is_file
 
         task = cosim.Scenario.load(scenario)
         if is_file(task.plant.fmu):

@@ -14,9 +14,9 @@ from typing import Annotated, Any
 
 import typer
 
-from cosim.errors import CosimError
-from cosim.files import write_atomically
-from cosim.processes import Terminated, hold, redirected_output, release, watch
+from cosim.core.errors import CosimError
+from cosim.core.files import write_atomically
+from cosim.core.processes import Terminated, hold, redirected_output, release, watch
 
 MOST = 100_000_000
 """Samples of the longest run."""
@@ -168,7 +168,7 @@ def resumable(
 @contextmanager
 def followed(out: Output, label: str, samples: int) -> Iterator[Callable[[int, str, str], None]]:
     """The `progress` of resumable work on so many samples: a bar, and a line for each event."""
-    from cosim.simulation import reporting
+    from cosim.core.simulation import reporting
 
     with resumable(), reporting(out.live, label, samples) as bar:
 

@@ -12,8 +12,8 @@ from typer.core import TyperGroup
 
 import cosim
 from cosim.cli import output as cli
-from cosim.errors import CosimError
-from cosim.files import write_atomically
+from cosim.core.errors import CosimError
+from cosim.core.files import write_atomically
 
 
 class ShowByDefault(TyperGroup):
@@ -44,7 +44,7 @@ def show(
         seed: Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.
     """
     with cli.output(json) as out_:
-        from cosim.scenario import presets
+        from cosim.core.scenario import presets
 
         if name is None:
             loaded = [cosim.Scenario.load(preset) for preset in presets()]
@@ -65,8 +65,8 @@ def show(
 
 
 def _seed_values(scenario: cosim.Scenario, seed: int) -> dict[str, float | bool | int]:
+    from cosim.core.simulation import spawn_seeds
     from cosim.plant.wiring import REALS, start_values
-    from cosim.simulation import spawn_seeds
 
     types: dict[str, Callable[[float], float | bool | int]] = dict.fromkeys(REALS, float)
     types["Boolean"] = bool

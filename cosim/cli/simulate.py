@@ -45,8 +45,8 @@ def simulate(
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with cli.output(json) as out_:
-        from cosim.errors import PlantError
-        from cosim.files import staged
+        from cosim.core.errors import PlantError
+        from cosim.core.files import staged
 
         loaded = cosim.Scenario.load(scenario)
         folder = cli.open_folder(out)
@@ -91,9 +91,9 @@ def _run(
     from importlib.metadata import version
 
     from controllers import compile_functions
-    from cosim.errors import RunEndedError
-    from cosim.plugins import parameters_hash
-    from cosim.simulation import functions_of
+    from cosim.core.errors import RunEndedError
+    from cosim.core.plugins import parameters_hash
+    from cosim.core.simulation import functions_of
 
     recorder = None
     if record:

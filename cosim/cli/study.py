@@ -55,7 +55,7 @@ def _execute(
     """Run a study with a progress bar; exits with code 1 where runs failed."""
     from loky import cpu_count
 
-    from cosim.errors import FailedRunsError
+    from cosim.core.errors import FailedRunsError
     from cosim.studies.plan import plan
 
     definition = cosim.Study.load(file)
@@ -195,7 +195,7 @@ def check(
             ones.
     """
     with cli.output(json) as out_:
-        from cosim.files import temporary_folder
+        from cosim.core.files import temporary_folder
         from cosim.studies import stored
 
         local = Path("results")

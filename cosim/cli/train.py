@@ -10,7 +10,7 @@ import typer
 
 import cosim
 from cosim.cli import output as cli
-from cosim.errors import CosimError
+from cosim.core.errors import CosimError
 
 if TYPE_CHECKING:
     from learning.configuration import Hyperparameter
@@ -65,7 +65,7 @@ def train(
     """
     with cli.output(json) as out_:
         from controllers.optimum import stored_optimum
-        from cosim.files import staged
+        from cosim.core.files import staged
         from learning.algorithm import load_algorithm
         from learning.training import CHECKPOINT, FILES, run_training
         from learning.training_run import make_run
@@ -138,7 +138,7 @@ def _explain(algorithm: str, hyperparameters: Sequence[Hyperparameter], output: 
 
 
 def _show(summary: dict[str, Any], output: cli.Output) -> None:
-    from cosim.statistics import shown
+    from cosim.core.statistics import shown
 
     title = (
         "{algorithm} ({requires}) on {scenario}, {samples} samples, seed {seed}: {status}"

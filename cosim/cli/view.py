@@ -22,7 +22,7 @@ def view(
             or the end.
     """
     with output(json) as out:
-        from cosim.errors import CosimError
+        from cosim.core.errors import CosimError
         from cosim.recording import open_viewer, render, summarise
 
         if at is not None and png is None:

@@ -10,6 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter
 
+from cosim.core.protocols import Array
+from cosim.core.statistics import mean as mean_of
+from cosim.core.statistics import regret, regret_terms
 from cosim.figures.style import (
     DASHED,
     REFERENCE,
@@ -21,9 +24,6 @@ from cosim.figures.style import (
     plain,
     regret_axis,
 )
-from cosim.protocols import Array
-from cosim.statistics import mean as mean_of
-from cosim.statistics import regret, regret_terms
 
 VIOLATION = 1e-3
 """Violation per sample below which its axis is linear."""

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FormatStrFormatter
 from numpy.typing import NDArray
 
-from cosim.errors import FigureError
-from cosim.files import write_atomically
+from cosim.core.errors import FigureError
+from cosim.core.files import write_atomically
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""

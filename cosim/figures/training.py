@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
+from cosim.core.protocols import Array
+from cosim.core.statistics import TD_WINDOW, regrets
 from cosim.figures.style import (
     DASHED,
     ENTRIES,
@@ -25,8 +27,6 @@ from cosim.figures.style import (
     samples_axis,
     symbol,
 )
-from cosim.protocols import Array
-from cosim.statistics import TD_WINDOW, regrets
 
 GREEDY = palette(["learnt"])["learnt"].color
 DECADES = 30.0

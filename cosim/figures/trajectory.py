@@ -15,7 +15,10 @@ from matplotlib.text import Annotation
 from numpy.typing import NDArray
 from PIL import Image
 
-from cosim.errors import FigureError
+from cosim.core.errors import FigureError
+from cosim.core.files import write_atomically
+from cosim.core.protocols import Array
+from cosim.core.scenario import Scenario
 from cosim.figures.style import (
     BOUND,
     DASHED,
@@ -27,14 +30,11 @@ from cosim.figures.style import (
     plain,
     shown_case,
 )
-from cosim.files import write_atomically
-from cosim.protocols import Array
-from cosim.scenario import Scenario
 
 FRAME = 350
 """Milliseconds of an animation's frame."""
 Run = Any
-"""A `cosim.trajectory.Trajectory`, which imports this module."""
+"""A `cosim.core.trajectory.Trajectory`, which imports this module."""
 
 
 def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[Run] = ()) -> Figure:

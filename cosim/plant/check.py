@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import fmus
-from cosim.errors import CosimError, PlantError
+from cosim.core.errors import CosimError, PlantError
+from cosim.core.scenario import Scenario
 from cosim.plant.draft import first_document, guess_roles, number_roles
 from cosim.plant.fmi import DESCRIPTION, SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
 from cosim.plant.probe import AFTER, Report, Row, probe
 from cosim.plant.starts import start_parameters
 from cosim.plant.wiring import REALS, refusals
-from cosim.scenario import Scenario
 from fmus import FmuError
 from fmus.check import information, problems_of
 

@@ -15,15 +15,15 @@ import numpy as np
 import tomli_w
 from scipy.optimize import least_squares
 
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
+from cosim.core.protocols import Array
+from cosim.core.scenario import Scenario
+from cosim.core.validation import suggestion
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
 from cosim.plant.probe import AFTER, Kind, Report, Restart, probe
 from cosim.plant.starts import candidates, start_parameters
 from cosim.plant.wiring import INTEGERS, NO_NUMBERS, REALS, refusals
-from cosim.protocols import Array
-from cosim.scenario import Scenario
-from cosim.validation import suggestion
 
 NO_NOISE = (
     "no noise was found (no output NAME with parameters NAME_nominal and NAME_range): the plant is "

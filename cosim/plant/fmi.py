@@ -36,8 +36,8 @@ from fmpy.model_description import read_model_description
 from numpy.typing import NDArray
 
 import fmus
-from cosim.errors import CapabilityError, FmuWarning, PlantError
-from cosim.files import cache_folder, lock, temporary_folder
+from cosim.core.errors import CapabilityError, FmuWarning, PlantError
+from cosim.core.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
 
 SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
@@ -259,9 +259,9 @@ def _obstacle(description: Any) -> str:
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
-    It lies in a `cosim.files.cache_folder`, whose path has no escapes in its URI, since many FMUs
-    do not read those in the URI of their resources. Raises OSError and what zipfile raises where
-    the archive cannot be unpacked.
+    It lies in a `cosim.core.files.cache_folder`, whose path has no escapes in its URI, since many
+    FMUs do not read those in the URI of their resources. Raises OSError and what zipfile raises
+    where the archive cannot be unpacked.
     """
     cache = cache_folder("fmus", plain=True)
     folder = cache / sha256

@@ -12,12 +12,12 @@ from typing import NoReturn, Self
 
 import numpy as np
 
-from cosim.errors import CapabilityError, PlantError
+from cosim.core.errors import CapabilityError, PlantError
+from cosim.core.protocols import Array, CompiledLoop, Step
+from cosim.core.scenario import Scenario
 from cosim.plant.fmi import NOT_FINITE, Instance, Intermediate, unpack
 from cosim.plant.probe import Restart, as_asked, probe_of, subject_of
 from cosim.plant.wiring import Wiring, refusals, seed_words
-from cosim.protocols import Array, CompiledLoop, Step
-from cosim.scenario import Scenario
 
 _NOT_STARTED = -1
 _HEADER = struct.Struct("<q32s")

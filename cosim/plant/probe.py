@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
+from cosim.core.scenario import Scenario
 from cosim.plant.fmi import (
     Experiment,
     Instance,
@@ -30,7 +31,6 @@ from cosim.plant.fmi import (
     unpack,
 )
 from cosim.plant.wiring import REALS, Wiring, experiment, has_start, interface
-from cosim.scenario import Scenario
 
 
 class Kind(Enum):

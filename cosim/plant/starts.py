@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
+from cosim.core.scenario import Scenario
 from cosim.plant.fmi import Order, Reading, UnpackedFmu, number
 from cosim.plant.wiring import REALS, Wiring, has_start
-from cosim.scenario import Scenario
 
 WORDS = ("start", "init", "initial", "ini", "initialvalue", "startvalue", "t0", "0")
 """What tools add to a state's name: `c_start` (Modelica), `T0` (20-sim), `x_initial`, `xInit`."""

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
+from cosim.core.scenario import PlantTable, Scenario
+from cosim.core.validation import suggestion
 from cosim.plant.fmi import (
     Experiment,
     Fmi2Instance,
@@ -20,8 +22,6 @@ from cosim.plant.fmi import (
     number,
     unpack,
 )
-from cosim.scenario import PlantTable, Scenario
-from cosim.validation import suggestion
 
 REALS = ("Real", "Float64", "Float32")
 
@@ -294,9 +294,9 @@ def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
 def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, float]]:
     """FMI type and value of each parameter that differs by scenario, the seed's words too.
 
-    `plant_seed`, 64 bits, is the first of `cosim.simulation.spawn_seeds`; an Integer, which has
-    32 bits and a sign, takes its low word, the next one the high word. Raises PlantError where the
-    scenario's FMU does not fit it.
+    `plant_seed`, 64 bits, is the first of `cosim.core.simulation.spawn_seeds`; an Integer, which
+    has 32 bits and a sign, takes its low word, the next one the high word. Raises PlantError where
+    the scenario's FMU does not fit it.
     """
     fmu = unpack(scenario.plant.fmu)
     wiring = Wiring(scenario, fmu)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
-from cosim.errors import RecordingError
-from cosim.scenario import VIOLATING
+from cosim.core.errors import RecordingError
+from cosim.core.scenario import VIOLATING
 
 TIME, SAMPLE, STATUS = "time", "sample", "/solver/status"
 SIGNAL = "cosim.Signal"

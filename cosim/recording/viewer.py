@@ -15,9 +15,9 @@ from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
-from cosim.errors import RecordingError
-from cosim.files import replacing
-from cosim.processes import child_process
+from cosim.core.errors import RecordingError
+from cosim.core.files import replacing
+from cosim.core.processes import child_process
 from cosim.recording.read import SAMPLE, TIME, existing, worst_moment
 
 LOOPBACK = "127.0.0.1"

@@ -22,15 +22,14 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun import escape_entity_path_part as escaped
 
-from cosim.comparison import RunSignals
-from cosim.errors import RecordingError
-from cosim.files import check_target, publish
-from cosim.protocols import Array, Controller
+from cosim.core.errors import RecordingError
+from cosim.core.files import check_target, publish
+from cosim.core.protocols import Array, Controller
+from cosim.core.result import markdown_table
+from cosim.core.scenario import Scenario
+from cosim.core.simulation import controller_name
+from cosim.core.trajectory import SIGNALS, RunSignals, SignalKind
 from cosim.recording.read import SAMPLE, SIGNAL, TIME
-from cosim.result import markdown_table
-from cosim.scenario import Scenario
-from cosim.simulation import controller_name
-from cosim.trajectory import SIGNALS, SignalKind
 
 if TYPE_CHECKING:
     from learning.training import Training

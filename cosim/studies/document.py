@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from cosim.errors import StudyError
-from cosim.files import read_toml
-from cosim.scenario import Table
-from cosim.validation import SchemaVersion, validated
+from cosim.core.errors import StudyError
+from cosim.core.files import read_toml
+from cosim.core.scenario import Table
+from cosim.core.validation import SchemaVersion, validated
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]

@@ -15,20 +15,20 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from cosim.errors import StudyError
+from cosim.core.errors import StudyError
+from cosim.core.protocols import Array
+from cosim.core.scenario import VIOLATING, Scenario
+from cosim.core.statistics import regrets, td_error_mean
+from cosim.core.trajectory import Trajectory, read_csv
 from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, DotRow, EndLabel, LineStyle, palette, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.measurement import built
-from cosim.protocols import Array
-from cosim.scenario import VIOLATING, Scenario
-from cosim.statistics import regrets, td_error_mean
 from cosim.studies.operation import Judged
 from cosim.studies.plan import Plan
 from cosim.studies.report import FOLDER
 from cosim.studies.run import LOG, PARAMETERS, Run, read_table, safe
-from cosim.trajectory import Trajectory, read_csv
 
 BANDED = 6
 """Largest number of curves with bands in a panel: more cannot be told apart."""

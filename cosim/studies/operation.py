@@ -15,13 +15,13 @@ from scipy.stats import ttest_1samp
 from controllers import compile_functions
 from controllers.factories import nmpc
 from controllers.optimum import QuasiStaticPolicy, fouling, frozen
+from cosim.core.plugins import build_controller
+from cosim.core.protocols import Array, Controller
+from cosim.core.result import TextTable
+from cosim.core.scenario import VIOLATING, Scenario
+from cosim.core.simulation import simulate
+from cosim.core.statistics import paired_difference, regrets, relative, shown
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller
-from cosim.protocols import Array, Controller
-from cosim.result import TextTable
-from cosim.scenario import VIOLATING, Scenario
-from cosim.simulation import simulate
-from cosim.statistics import paired_difference, regrets, relative, shown
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
 from learning.log import LogRow

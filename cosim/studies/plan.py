@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, get_args, get_origin
 
 from controllers.optimum import stored_optimum
-from cosim.errors import StudyError
+from cosim.core.errors import StudyError
+from cosim.core.modules import import_from
+from cosim.core.plugins import ControllerSource
+from cosim.core.scenario import Scenario, resolved
+from cosim.core.validation import instead, validated
 from cosim.evaluation import EVALUATION
 from cosim.identity import code_hash, versions
 from cosim.measurement import Noise
-from cosim.modules import import_from
 from cosim.plant import FmuPlant
-from cosim.plugins import ControllerSource
-from cosim.scenario import Scenario, resolved
 from cosim.studies.document import DEFAULT, CaseTable, StudyTable, TrajectoryTable, read
 from cosim.studies.run import (
     GREEDY,
@@ -30,7 +31,6 @@ from cosim.studies.run import (
     functions_for,
     safe,
 )
-from cosim.validation import instead, validated
 from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError

@@ -16,8 +16,8 @@ import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-from cosim.result import markdown_table
-from cosim.statistics import shown
+from cosim.core.result import markdown_table
+from cosim.core.statistics import shown
 
 PAGE, TABLES, FOLDER = "report.html", "report.md", "figures"
 

@@ -15,16 +15,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cosim import statistics
-from cosim.errors import FailedRunsError, StudyError
+from cosim.core import statistics
+from cosim.core.errors import FailedRunsError, StudyError
+from cosim.core.files import read_json, staged, write_atomically
+from cosim.core.processes import holding
+from cosim.core.protocols import Array
+from cosim.core.result import Shown, TextTable, markdown_table
+from cosim.core.simulation import reporting
+from cosim.core.statistics import Estimate, over_runs, paired_difference, shown, two_way
+from cosim.core.validation import instead
 from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
-from cosim.files import read_json, staged, write_atomically
-from cosim.processes import holding
-from cosim.protocols import Array
-from cosim.result import Shown, TextTable, markdown_table
-from cosim.simulation import reporting
-from cosim.statistics import Estimate, over_runs, paired_difference, shown, two_way
 from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
 from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
@@ -39,7 +40,6 @@ from cosim.studies.run import (
     to_csv,
     typed,
 )
-from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"

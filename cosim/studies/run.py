@@ -21,14 +21,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from controllers.functions import COMPILED, INTERPRETED, LONG, switch
-from cosim.errors import StudyError
+from cosim.core.errors import StudyError
+from cosim.core.files import read_json, temporary_folder, write_atomically
+from cosim.core.modules import UNKNOWN
+from cosim.core.plugins import ControllerSource
+from cosim.core.scenario import Scenario
 from cosim.evaluation import EVALUATION, TIMING, Progress
-from cosim.files import read_json, temporary_folder, write_atomically
 from cosim.identity import changed, file_hash
 from cosim.measurement import Factory, Measured, MeasureItem, Noise
-from cosim.modules import UNKNOWN
-from cosim.plugins import ControllerSource
-from cosim.scenario import Scenario
 from cosim.workers import Conditions, Failure, Item, done
 
 if TYPE_CHECKING:

@@ -12,10 +12,11 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from cosim.errors import ResultsError
+from cosim.core.errors import ResultsError
+from cosim.core.files import read_toml, write_atomically
+from cosim.core.scenario import Table
+from cosim.core.validation import instead, validated
 from cosim.evaluation import EVALUATION, TIMING
-from cosim.files import read_toml, write_atomically
-from cosim.scenario import Table
 from cosim.studies import figures
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
@@ -33,7 +34,6 @@ from cosim.studies.results import (
 )
 from cosim.studies.results import RUNS as RUNS_TABLE
 from cosim.studies.run import GREEDY, RUNS, to_csv
-from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"

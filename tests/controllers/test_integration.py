@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.errors import ModelError, ModelWarning
 from controllers.integration import TOLERANCE, measure_integration
-from cosim.scenario import Scenario
+from cosim.core.scenario import Scenario
 from tests.helpers.models import make_model, make_problem
 
 PRESETS = ("paper", "fast-sampling", "slow-sampling", "reactor", "tanks")

@@ -10,7 +10,7 @@ from controllers.economic import optimal_steady_state
 from controllers.errors import ModelError
 from controllers.problem import Problem, load_model, multipliers
 from controllers.theta import ThetaBlocks
-from cosim.scenario import Scenario
+from cosim.core.scenario import Scenario
 from tests.helpers import linear_plant
 from tests.helpers.other_units import ACTION, COST, STATE, factors, problems
 from tests.helpers.sampling import evaporator_problem

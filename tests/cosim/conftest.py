@@ -14,7 +14,7 @@ def plant(request, paper):
 @pytest.fixture
 def unwatched(monkeypatch):
     """Foreign code is run in this process, where a test is not about the process of its own."""
-    monkeypatch.setattr("cosim.processes._watched", True)
+    monkeypatch.setattr("cosim.core.processes._watched", True)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import fmus
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
 from cosim.plant import fmi
 from cosim.plant.fmi import place, unpack
 from tests.helpers.command import run_cosim

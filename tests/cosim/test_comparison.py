@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from cosim import FmuPlant, simulate
 from cosim.comparison import RunSignals, compare, load_run
-from cosim.errors import ComparisonError
+from cosim.core.errors import ComparisonError
+from cosim.core.trajectory import Signal
 from cosim.recording import RerunRecorder
-from cosim.trajectory import Signal
 from tests.helpers.loop import Proportional
 
 values = st.one_of(st.floats(-1e3, 1e3), st.just(float("nan")), st.just(float("inf")))

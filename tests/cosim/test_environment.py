@@ -4,8 +4,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from cosim import FmuPlant, simulate
+from cosim.core.errors import PlantError
 from cosim.environment import NormalisedEnv, PlantEnv
-from cosim.errors import PlantError
 from tests.helpers.loop import Proportional
 
 # Actions are in physical units on purpose; the checker recommends a normalised space.

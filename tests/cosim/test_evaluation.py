@@ -6,7 +6,7 @@ import pytest
 
 from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
-from cosim.errors import EvaluationError
+from cosim.core.errors import EvaluationError
 from tests.helpers.loop import Proportional, hold, proportional
 from tests.helpers.workers import LEDGER, always_dying, mortal, noting
 

@@ -11,7 +11,7 @@ import pytest
 
 import fmus
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import CapabilityError, FmuWarning, PlantError, ScenarioError
+from cosim.core.errors import CapabilityError, FmuWarning, PlantError, ScenarioError
 from cosim.plant.fmi import unpack
 from tests.helpers.command import run_cosim
 from tests.helpers.kinds import REALS, build_kind, scenario_for

@@ -11,10 +11,10 @@ import pytest
 
 from controllers import Parameters, Problem
 from cosim import Scenario, evaluate, study
-from cosim.errors import ControllerLookupError, CosimError, FailedRunsError
+from cosim.core.errors import ControllerLookupError, CosimError, FailedRunsError
+from cosim.core.modules import UNKNOWN, import_from, load_plugin
 from cosim.identity import changed, code_hash, depends_on
-from cosim.modules import UNKNOWN, import_from, load_plugin
-from tests.cosim.test_processes import HOLD
+from tests.cosim.core.test_processes import HOLD
 from tests.helpers.loop import Proportional
 
 ROOT = Path(__file__).parents[2]

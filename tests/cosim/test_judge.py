@@ -11,9 +11,9 @@ import pytest
 
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import EvaluationError
+from cosim.core.errors import EvaluationError
+from cosim.core.simulation import indicators
 from cosim.evaluation import judge
-from cosim.simulation import indicators
 from tests.helpers.loop import Hold
 
 ROOT = Path(__file__).parents[2]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
 
 ACTIONS = np.random.default_rng(7).uniform(100, 400, (50, 2))
 
@@ -182,7 +182,7 @@ def test_a_snapshot_of_another_plant_is_refused(plant, paper):
     ],
 )
 def test_a_scenario_that_does_not_fit_the_fmu_is_refused_by_name(paper, change, words):
-    from cosim.errors import CosimError
+    from cosim.core.errors import CosimError
 
     with pytest.raises(CosimError) as error:
         FmuPlant(paper.replace({"plant": change}))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import CapabilityError, PlantError
+from cosim.core.errors import CapabilityError, PlantError
 from cosim.plant.probe import Kind, Restart, probe
 from tests.helpers.kinds import build_habits, habit_scenario
 from tests.helpers.loop import Playback

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.foreign import scenario_of, verdict
 from cosim import FmuPlant, Scenario
-from cosim.errors import PlantError
+from cosim.core.errors import PlantError
 from cosim.plant.draft import draft_scenario
 from cosim.plant.fmi import unpack
 

@@ -13,8 +13,8 @@ import pytest
 
 from cosim import Decision, FmuPlant, Scenario, simulate
 from cosim.comparison import compare, load_run
-from cosim.errors import CosimError, StudyError
-from cosim.files import check_target, protect, write_atomically
+from cosim.core.errors import CosimError, StudyError
+from cosim.core.files import check_target, protect, write_atomically
 from cosim.recording import RerunRecorder
 from cosim.studies.run import Run
 from tests.helpers.command import run_cosim

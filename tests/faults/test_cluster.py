@@ -20,7 +20,7 @@ import pytest
 from controllers.factories import naive
 from cosim import evaluate
 from cosim import workers as engine
-from cosim.errors import EvaluationError
+from cosim.core.errors import EvaluationError
 
 pytest.importorskip("distributed")
 ROOT = Path(__file__).parents[2]

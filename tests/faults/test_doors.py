@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from controllers.factories import naive
 from cosim import Decision, FmuPlant, Scenario, Study, evaluate, simulate, train
-from cosim.errors import CosimError
+from cosim.core.errors import CosimError
 from cosim.evaluation import judge
 from learning import checkpoint
 from learning.training_run import make_run

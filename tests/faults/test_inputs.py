@@ -20,7 +20,7 @@ from controllers.errors import ParameterError
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from cosim.cli.main import app
-from cosim.errors import ScenarioError
+from cosim.core.errors import ScenarioError
 from learning.algorithm import algorithms, load_algorithm
 from learning.errors import ConfigurationError
 

@@ -8,7 +8,7 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.comparison import compare, load_run
-from cosim.errors import CosimError
+from cosim.core.errors import CosimError
 from tests.cosim.studies.test_study import contents
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Proportional

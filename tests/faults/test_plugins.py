@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from cosim import Scenario
-from cosim.errors import ControllerLookupError
-from cosim.plugins import build_controller
+from cosim.core.errors import ControllerLookupError
+from cosim.core.plugins import build_controller
 from learning.algorithm import load_algorithm
 from learning.errors import AlgorithmLookupError
 from tests.helpers.command import run_cosim

@@ -19,10 +19,10 @@ from controllers import Parameters, Problem
 from controllers.errors import ParameterError
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import PlantError, RecordingError, ScenarioError, TrajectoryError
+from cosim.core.errors import PlantError, RecordingError, ScenarioError, TrajectoryError
+from cosim.core.trajectory import read_csv
 from cosim.plant.fmi import unpack
 from cosim.recording import RerunRecorder, read_recording
-from cosim.trajectory import read_csv
 from fmus import path as shipped
 from learning import checkpoint
 from learning.errors import CheckpointError

@@ -7,7 +7,7 @@ import pytest
 
 import fmus
 from cosim import Scenario, evaluate, measurement
-from cosim.errors import EvaluationError, PlantError
+from cosim.core.errors import EvaluationError, PlantError
 from tests.helpers.loop import Proportional
 
 

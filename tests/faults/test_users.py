@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cosim.test_processes import HOLD
+from tests.cosim.core.test_processes import HOLD
 
 pytestmark = [
     pytest.mark.slow,

@@ -13,7 +13,7 @@ from lxml import etree
 
 import fmus
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_loop
-from cosim.scenario import Scenario
+from cosim.core.scenario import Scenario
 from fmus import plant as plants
 from fmus.build import build_model
 from fmus.evaporator import EVAPORATOR, UNITS, VARIABLES

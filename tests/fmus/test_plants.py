@@ -12,7 +12,7 @@ from benchmarks import importers
 from controllers.factories import naive
 from controllers.problem import load_model
 from cosim import FmuPlant, Scenario, simulate
-from cosim.files import CACHE_VARIABLE
+from cosim.core.files import CACHE_VARIABLE
 from fmus import plant as plants
 from fmus.plant import build_plant
 from tests.helpers.command import run_cosim

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cosim.trajectory import SIGNALS
+from cosim.core.trajectory import SIGNALS
 
 
 def random_block(scenario, rng, first=0, samples=10):

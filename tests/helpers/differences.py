@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from controllers import LinearisationPoint, Parameters, RtiNmpc, RtiSolution
-from controllers.rti.preparation import Spectrum
+from controllers.preparation import Spectrum
 
 STEPS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 SOLVER = 1e-11  # of an action; DAQP is good to its primal tolerance, 1e-10

@@ -7,8 +7,8 @@ from scipy.linalg import solve_discrete_are
 from controllers.model import Model, Quantity, discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.protocols import Step
-from cosim.scenario import Scenario
+from cosim.core.protocols import Step
+from cosim.core.scenario import Scenario
 
 A_CONTINUOUS = np.array([[-0.2, 0.6], [-0.4, 0.1]])
 B_CONTINUOUS = np.array([[0.1], [0.8]])

@@ -8,7 +8,7 @@ import numpy as np
 from controllers import evaporator
 from controllers.model import discretise
 from controllers.problem import Problem
-from cosim.protocols import Step
+from cosim.core.protocols import Step
 
 STATE = np.array([10.0, 0.1])
 ACTION = np.array([0.1, 10.0])

@@ -13,7 +13,7 @@ import pytest
 from controllers import Parameters, Problem, RtiNmpc, functions
 from controllers.export import core, plain_c
 from cosim import FmuPlant, Scenario, simulate, train
-from cosim.simulation import spawn_seeds
+from cosim.core.simulation import spawn_seeds
 from learning.empirical_model import EmpiricalModel, Features
 from learning.rollout import Rollout
 from tests.helpers.compiler import needs_compiler

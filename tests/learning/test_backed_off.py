@@ -5,9 +5,9 @@ import pytest
 
 from controllers.economic import tune
 from controllers.rti import RtiNmpc
+from cosim.core.plugins import build_controller
+from cosim.core.simulation import simulate
 from cosim.plant import FmuPlant
-from cosim.plugins import build_controller
-from cosim.simulation import simulate
 from learning import training_run
 from learning.backed_off import add_reserve, back_off
 from learning.training_run import make_run

@@ -3,7 +3,7 @@ import pytest
 
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
-from cosim.simulation import indicators_of
+from cosim.core.simulation import indicators_of
 from learning.evaluator import Evaluator
 from learning.log import METRICS
 from learning.training_run import HELD_OUT

@@ -9,7 +9,7 @@ import pytest
 from controllers.errors import QpError
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant, simulate
-from cosim.simulation import spawn_seeds
+from cosim.core.simulation import spawn_seeds
 from learning import QLearning
 from learning.algorithm import Update
 from learning.errors import PrivilegeError

@@ -3,7 +3,7 @@ import pytest
 
 from controllers.model import discretise
 from controllers.theta import Parameters, ThetaBlocks
-from cosim.scenario import Penalty
+from cosim.core.scenario import Penalty
 from learning.prediction_errors import (
     OneStepModel,
     PredictionErrors,

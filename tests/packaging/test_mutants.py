@@ -12,7 +12,7 @@ from benchmarks.mutants import CHECKOUT, MUTANTS, MutantError, load
 MUTANT = """\
 [[mutant]]
 name = "one"
-file = "cosim/statistics.py"
+file = "cosim/core/statistics.py"
 old = {old!r}
 new = "pass"
 group = "statistics"

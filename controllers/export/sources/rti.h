@@ -15,7 +15,7 @@
 enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE };
 
 /* A QP without its state. Given: the point of linearisation (states x_0 … x_{N−1}, actions, costates
- * χ_1 … χ_N) and θ. `stack` has what `controllers.rti.preparation` makes of it. Doubles only, in the order
+ * χ_1 … χ_N) and θ. `stack` has what `controllers.preparation` makes of it. Doubles only, in the order
  * in which Python has them (`controllers.rti.nmpc`). */
 typedef struct {
     double x[HORIZON][N_X], u[HORIZON][N_U];

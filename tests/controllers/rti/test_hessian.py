@@ -4,7 +4,7 @@ import pytest
 
 from controllers import ThetaBlocks
 from controllers.model import discretise
-from controllers.rti.preparation import HESSIANS, Exact, Spectrum, preparation
+from controllers.preparation import HESSIANS, Exact, Spectrum, preparation
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point
 
 N, n, m = 10, 2, 2

@@ -11,8 +11,8 @@ from rerun.chunk import RrdReader
 
 from controllers.factories import naive
 from cosim import FmuPlant, simulate, train
-from cosim.comparison import RunSignals
-from cosim.errors import RecordingError
+from cosim.core.errors import RecordingError
+from cosim.core.trajectory import RunSignals, Signal, read_csv
 from cosim.recording import (
     RerunRecorder,
     read_recording,
@@ -22,7 +22,6 @@ from cosim.recording import (
 )
 from cosim.recording.read import worst_moment
 from cosim.recording.write import drawable
-from cosim.trajectory import Signal, read_csv
 from tests.helpers.blocks import random_block
 from tests.helpers.loop import Proportional
 

@@ -8,7 +8,7 @@ import psutil
 import pytest
 from matplotlib.image import imread
 
-from cosim.errors import RecordingError
+from cosim.core.errors import RecordingError
 from cosim.recording import open_viewer, render, viewer
 from tests.cosim.recording.test_recording import recorded
 from tests.helpers.blocks import random_block

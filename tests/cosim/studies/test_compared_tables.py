@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.errors import ResultsError
+from cosim.core.errors import ResultsError
 from cosim.studies.stored import (
     WORDS,
     compared_tables,

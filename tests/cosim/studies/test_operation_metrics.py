@@ -7,7 +7,7 @@ from scipy import stats
 
 from controllers.factories import nmpc
 from cosim import FmuPlant, Scenario, study
-from cosim.simulation import spawn_seeds
+from cosim.core.simulation import spawn_seeds
 from cosim.studies.operation import LIFE, SHIFT, dearer_than, judged, metrics, tables
 from learning.training_run import make_run
 from tests.helpers.toy_study import case, document

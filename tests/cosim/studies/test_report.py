@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.errors import StudyError
+from cosim.core.errors import StudyError
 from cosim.studies.results import KEYS, StudyResults
 from cosim.studies.run import to_csv
 from tests.helpers.toy_study import GROW, run_toy

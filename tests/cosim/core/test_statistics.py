@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import trim_mean, wilcoxon
 
-from cosim import statistics
-from cosim.statistics import (
+from cosim.core import statistics
+from cosim.core.statistics import (
     bootstrapped,
     gain,
     gap_closed,

@@ -9,12 +9,12 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Self
 
-from cosim.errors import ControllerLookupError
-from cosim.files import read_text
-from cosim.modules import OURS, exception_line, importing, load_plugin
-from cosim.protocols import Controller
-from cosim.scenario import Scenario
-from cosim.validation import suggestion
+from cosim.core.errors import ControllerLookupError
+from cosim.core.files import read_text
+from cosim.core.modules import OURS, exception_line, importing, load_plugin
+from cosim.core.protocols import Controller
+from cosim.core.scenario import Scenario
+from cosim.core.validation import suggestion
 
 CONTROLLERS, ALGORITHMS = "cosim.controllers", "cosim.algorithms"
 """Groups of entry points: factory(scenario), and algorithms."""

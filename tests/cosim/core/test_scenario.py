@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.errors import ScenarioError
-from cosim.scenario import Penalty, Scenario, presets
+from cosim.core.errors import ScenarioError
+from cosim.core.scenario import Penalty, Scenario, presets
 
 
 def test_the_plant_as_it_is_at_a_time_is_a_scenario_of_its_own(paper):

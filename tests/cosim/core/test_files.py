@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim import files
-from cosim.files import (
+from cosim.core import files
+from cosim.core.files import (
     cache_folder,
     lock,
     read_json,

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cosim.files import write_atomically
+from cosim.core.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from cosim import Scenario
-from cosim.plugins import build_controller
+from cosim.core.plugins import build_controller
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PAPER = Scenario.load("paper")
 CONTROLLER = (
     "from {helper} import HORIZON\n"
@@ -53,7 +53,10 @@ def test_a_factory_of_the_working_directory_is_found_and_the_import_path_is_as_b
 def test_the_working_directory_hides_none_of_our_packages(tmp_path, package):
     (tmp_path / "learning").mkdir() if not package else (tmp_path / "learning.py").touch()
     (tmp_path / "mine.py").write_text("import learning\nfound = learning.__file__\n")
-    code = "from cosim.modules import load_plugin; print(load_plugin('mine:found', 'it', OSError))"
+    code = (
+        "from cosim.core.modules import load_plugin; "
+        "print(load_plugin('mine:found', 'it', OSError))"
+    )
     done = subprocess.run(
         [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )

@@ -17,13 +17,13 @@ from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
 
-from cosim.processes import watch
+from cosim.core.processes import watch
 
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 """Form of an object's name, `module:Name`."""
 OURS = ("fmus", "cosim", "controllers", "learning")
 """The packages of this distribution; any other is a user's."""
-ROOT = Path(__file__).absolute().parents[1]
+ROOT = Path(__file__).absolute().parents[2]
 """Folder that holds them."""
 PYTHON = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
 """Folders of Python's own modules."""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from cosim.protocols import Array
+from cosim.core.protocols import Array
 
 Interval = tuple[float, float] | None
 

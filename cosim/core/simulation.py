@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from cosim.errors import CosimError, PlantError, RunEndedError
-from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
-from cosim.scenario import Scenario
-from cosim.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
-from cosim.validation import whole_number
+from cosim.core.errors import CosimError, PlantError, RunEndedError
+from cosim.core.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
+from cosim.core.scenario import Scenario
+from cosim.core.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
+from cosim.core.validation import whole_number
 
 MEASURED = (
     "states", "actions", "stage_cost", "disturbances", "value", "residual", "failed",
     "prepare_time", "feedback_time", "plant_time",
 )  # fmt: skip
-"""Signals in a row of the loop's table, in order (`cosim.protocols.CompiledLoop`)."""
+"""Signals in a row of the loop's table, in order (`cosim.core.protocols.CompiledLoop`)."""
 REFRESH = 0.1
 """Seconds between two drawings of a progress bar, at least."""
 PREDICTED = ("predicted_states", "predicted_actions")

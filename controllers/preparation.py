@@ -17,8 +17,8 @@ from controllers.model import runge_kutta
 from controllers.problem import Problem
 from controllers.qp import SoftQp
 from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
-from cosim.protocols import Vector
-from cosim.validation import instead
+from cosim.core.protocols import Vector
+from cosim.core.validation import instead
 
 RESIDUAL = 1e-8
 """Largest KKT residual of a QP that counts as solved."""

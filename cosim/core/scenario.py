@@ -19,11 +19,11 @@ import tomli_w
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cosim.errors import ScenarioError
-from cosim.files import read_toml
-from cosim.modules import import_from
-from cosim.result import Shown
-from cosim.validation import SchemaVersion, suggestion, validated
+from cosim.core.errors import ScenarioError
+from cosim.core.files import read_toml
+from cosim.core.modules import import_from
+from cosim.core.result import Shown
+from cosim.core.validation import SchemaVersion, suggestion, validated
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -443,7 +443,7 @@ class Scenario(Shown, Table):
         return np.minimum(np.maximum(action, self.action_lower), self.action_upper)
 
 
-PRESETS = Path(__file__).parent / "presets"
+PRESETS = Path(__file__).parents[1] / "presets"
 
 
 def presets() -> list[str]:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from cosim.errors import TrajectoryError
-from cosim.files import replacing
-from cosim.protocols import Array
-from cosim.result import Result, csv_text
-from cosim.scenario import VIOLATING, Scenario
+from cosim.core.errors import TrajectoryError
+from cosim.core.files import replacing
+from cosim.core.protocols import Array
+from cosim.core.result import Result, csv_text
+from cosim.core.scenario import VIOLATING, Scenario
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,6 +101,30 @@ class Signal:
     name: str
     unit: str
     values: Array
+
+
+@dataclass(frozen=True)
+class RunSignals:
+    """A run's `signals` by name, all of K samples, and the status of each ([] if not known).
+
+    `name` is its path; `bounds` are (lower, upper) of signals with known bounds; `ordered` says
+    that the order of the signals is that of a file's columns.
+    """
+
+    name: str
+    signals: Mapping[str, Signal]
+    status: Sequence[str] = ()
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    ordered: bool = True
+
+    @property
+    def label(self) -> str:
+        """The run's folder, or the file where its name says more than `trajectory` or `run`."""
+        path = Path(self.name)
+        return path.parent.name or path.stem if path.stem in ("trajectory", "run") else path.stem
+
+    def __len__(self) -> int:
+        return max((len(signal.values) for signal in self.signals.values()), default=0)
 
 
 @dataclass(frozen=True, repr=False)
@@ -191,8 +215,8 @@ class Trajectory(Result):
         """Means a sample after the first `burn_in`.
 
         `economic_cost` ℓ; `mean_violation` Σᵢ vᵢ; `violating_share` share of samples with Σᵢ vᵢ >
-        `cosim.scenario.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does not
-        count; `J` mean of ℓ + penalty, to which every violation counts.
+        `cosim.core.scenario.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does
+        not count; `J` mean of ℓ + penalty, to which every violation counts.
         """
         names = ("stage_cost", "penalty", "violation")
         cost, penalty, violation = (self[name][burn_in:] for name in names)

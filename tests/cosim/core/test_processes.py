@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cosim import processes
-from cosim.errors import CosimError
-from cosim.processes import child_process
+from cosim.core import processes
+from cosim.core.errors import CosimError
+from cosim.core.processes import child_process
 from tests.helpers.command import alive, eventually, run_cosim, start_cosim
 from tests.helpers.kinds import build_kind, scenario_for
 
@@ -46,7 +46,7 @@ def test_workers_end_with_the_parent(tmp_path):
 
 CHILD = (
     "import subprocess, sys\n"
-    "from cosim.processes import command_process, child_process\n"
+    "from cosim.core.processes import command_process, child_process\n"
     "words = [sys.executable, '-c', 'import os, time; print(os.getpid(), flush=True);'\n"
     "         'time.sleep(600)']\n"
     "with command_process(), child_process(words) as child:\n    child.wait(600.0)\n"
@@ -95,7 +95,7 @@ def test_a_child_has_its_exit_code_and_its_temporary_files_in_its_folder(tmp_pat
 HOLD = (
     "import sys, time\n"
     "from pathlib import Path\n"
-    "from cosim.processes import hold\n"
+    "from cosim.core.processes import hold\n"
     "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)\n"
 )
 
@@ -144,7 +144,7 @@ def run_foreign(folder, fmu, fault, *more):
     """A short run of an FMU with a fault of its kind."""
     scenario = scenario_for(folder, fmu, fault=fault)
     words = ["simulate", "-s", scenario, "-c", "tests.helpers.loop:hold", "-n", 3, "--out", "out"]
-    environment = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = {"PYTHONPATH": str(Path(__file__).parents[3])}
     return run_cosim(*words, *more, folder=folder, env=environment)
 
 
@@ -170,7 +170,7 @@ def test_an_fmu_that_ends_the_process_is_one_line_and_exit_code_2(tmp_path, faul
 def test_the_watched_process_ends_with_the_watching_one(tmp_path):
     scenario = scenario_for(tmp_path, build_kind(tmp_path, 2), fault=12)
     words = ["simulate", "-s", scenario, "-c", "tests.helpers.loop:hold", "-n", 3, "--out", "out"]
-    environment = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = {"PYTHONPATH": str(Path(__file__).parents[3])}
     with start_cosim(*words, folder=tmp_path, env=environment) as process:
         assert "native code of" in process.stderr.readline()
         process.send_signal(signal.SIGKILL)

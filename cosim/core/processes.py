@@ -17,8 +17,8 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
-from cosim.errors import CosimError, PlantError
-from cosim.files import STAGED, lock, temporary_folder, write_atomically
+from cosim.core.errors import CosimError, PlantError
+from cosim.core.files import STAGED, lock, temporary_folder, write_atomically
 
 # psutil and filelock are imported where they are needed: every command imports this file.
 if TYPE_CHECKING:
@@ -299,8 +299,8 @@ def watch(suspect: str) -> None:
         mark = temporary / "finished"
         # Pass on the import path: a folder of the user's may have the name of a package.
         program = (
-            f"import sys; sys.path[:] = {sys.path}; from cosim import cli, processes; "
-            f"processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"
+            f"import sys; sys.path[:] = {sys.path}; from cosim import cli; "
+            f"from cosim.core import processes; processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"
         )
         words = [sys.executable, *flags, "-c", program, *sys.argv[1:]]
         child = subprocess.Popen(words, stdout=(*_stdout, None)[0])

@@ -3,9 +3,9 @@ import pytest
 
 from cosim import FmuPlant, simulate
 from cosim.comparison import compare, load_run
-from cosim.errors import TrajectoryError
+from cosim.core.errors import TrajectoryError
+from cosim.core.trajectory import SIGNALS, SignalKind, read_csv
 from cosim.recording import RerunRecorder, read_recording
-from cosim.trajectory import SIGNALS, SignalKind, read_csv
 from tests.helpers.loop import Proportional
 
 

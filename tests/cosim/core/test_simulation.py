@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import PlantError, RunEndedError
-from cosim.plugins import build_controller
-from cosim.simulation import PART, indicators, input_effort, spawn_seeds
-from cosim.trajectory import FALLBACK
+from cosim.core.errors import PlantError, RunEndedError
+from cosim.core.plugins import build_controller
+from cosim.core.simulation import PART, indicators, input_effort, spawn_seeds
+from cosim.core.trajectory import FALLBACK
 from tests.helpers.loop import Failing, Hold, Proportional
 
 
@@ -123,7 +123,7 @@ def test_a_recorder_gets_the_whole_run_in_parts(evaporator, paper):
 
 def test_recording_does_not_change_the_run_nor_do_longer_parts(evaporator, paper, monkeypatch):
     plain, recorder = simulate(evaporator, Predicting(paper), 600, seed=9), Recorder()
-    monkeypatch.setattr("cosim.simulation.PART", 2)
+    monkeypatch.setattr("cosim.core.simulation.PART", 2)
     assert same(plain, simulate(evaporator, Predicting(paper), 600, seed=9, recorder=recorder))
     assert [first for first, *_ in recorder.blocks] == [*range(0, 600, 600 // 200)]
 

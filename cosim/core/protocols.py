@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from cosim.scenario import Scenario
+    from cosim.core.scenario import Scenario
 
 Array = NDArray[np.float64]
 Vector = Array

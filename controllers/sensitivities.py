@@ -7,14 +7,14 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
 import casadi as ca
 import numpy as np
 
 from controllers.functions import StackedFunction
-from controllers.preparation import stage_parameter_gradient
+from controllers.preparation import stage_function, stage_parameter_gradient
 from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
@@ -53,6 +53,111 @@ def _theta_part(
     return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
 
 
+def _stage_arguments(
+    problem: Problem, inputs: Mapping[str, ca.MX], *, exact: bool
+) -> dict[str, ca.MX]:
+    """Arguments of `stage_parameter_gradient`, those of stage 0, 1, … side by side."""
+    horizon, scale = problem.horizon, problem.scale
+    v = inputs["v"] * ca.repmat(ca.DM(scale.action), 1, horizon)
+    w = ca.vertcat(inputs["xi"][:, :horizon], v) + ca.repmat(ca.DM(problem.reference), 1, horizon)
+    arguments = {
+        "x": inputs["x"],
+        "u": inputs["u"],
+        "theta": ca.repmat(inputs["theta"], 1, horizon),
+        "w": w,
+        "chi": inputs["chi"][:, 1:],
+    }
+    if exact:
+        arguments |= {"M": inputs["M"], "guess": inputs["guess"]}
+    return arguments
+
+
+def _value_gradient_by_stages(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    inputs: Mapping[str, ca.SX],
+    results: Mapping[str, ca.SX],
+    *,
+    exact: bool,
+) -> StackedFunction:
+    """The value's gradient with that in p, the sum of a function of one stage over the horizon.
+
+    Args:
+        problem: the control problem.
+        blocks: the blocks of θ, p among them.
+        inputs: arguments of the gradient by name.
+        results: `gradient` (n_θ), in which the part of p is missing.
+        exact: whether the QP's Hessian is the exact one.
+
+    Returns:
+        The function of the same inputs with the whole gradient.
+    """
+    rest = stage_function("value_gradient_rest", inputs, results)
+    symbols = {name: ca.MX.sym(name, *symbol.shape) for name, symbol in inputs.items()}
+    stage = stage_parameter_gradient(problem, blocks, exact=exact)
+    stages = stage.map(problem.horizon)(*_stage_arguments(problem, symbols, exact=exact).values())
+    gradient = rest(*symbols.values())
+    gradient[blocks.slices["p"]] = ca.sum2(stages)
+    return StackedFunction("value_gradient", symbols, {"gradient": gradient})
+
+
+def _policy_jacobian_by_stages(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    inputs: Mapping[str, ca.SX],
+    results: Mapping[str, ca.SX],
+    directions: Sequence[tuple[ca.SX, ca.SX]],
+    *,
+    exact: bool,
+) -> StackedFunction:
+    """The policy's derivatives with that in p, a sum of a function of one stage over the horizon.
+
+    Args:
+        problem: the control problem.
+        blocks: the blocks of θ, p among them.
+        inputs: arguments of the derivatives by name.
+        results: `policy` (n_θ, m), in which the part of p is missing, and `state` (n, m).
+        directions: of each action the adjoint directions of w (n+m, N) and χ (n, N) in the model's
+            units.
+        exact: whether the QP's Hessian is the exact one.
+
+    Returns:
+        The function of the same inputs with all of `policy`.
+    """
+    horizon = problem.horizon
+    moved = {
+        f"{name}_{action}": direction
+        for action, pair in enumerate(directions)
+        for name, direction in zip(("w", "chi"), pair, strict=True)
+    }
+    rest = stage_function("policy_jacobian_rest", inputs, {**results, **moved})
+    symbols = {name: ca.MX.sym(name, *symbol.shape) for name, symbol in inputs.items()}
+    parts = dict(zip(rest.name_out(), rest(*symbols.values()), strict=True))
+    arguments = _stage_arguments(problem, symbols, exact=exact)
+    stage = _moved_stage_gradient(problem, blocks, exact=exact).map(horizon)
+    policy = parts["policy"]
+    for action in range(problem.n_actions):
+        along = [parts[f"w_{action}"], parts[f"chi_{action}"]]
+        if exact:
+            size = problem.n_states + problem.n_actions
+            along.append(ca.reshape(symbols["dM"][:, action], size, horizon * size))
+        policy[blocks.slices["p"], action] = -ca.sum2(stage(*arguments.values(), *along))
+    return StackedFunction("policy_jacobian", symbols, {"policy": policy, "state": parts["state"]})
+
+
+def _moved_stage_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> ca.Function:
+    """Directional derivative of `stage_parameter_gradient` in w, χ and, with `exact`, M."""
+    stage = stage_parameter_gradient(problem, blocks, exact=exact)
+    names = ("w", "chi", "M") if exact else ("w", "chi")
+    arguments = {name: ca.SX.sym(name, *stage.size_in(i)) for i, name in enumerate(stage.name_in())}
+    along = {f"moved_{name}": ca.SX.sym(f"moved_{name}", *arguments[name].shape) for name in names}
+    variables = ca.veccat(*(arguments[name] for name in names))
+    derivative = ca.jtimes(stage(*arguments.values()), variables, ca.veccat(*along.values()))
+    return stage_function(
+        "moved_parameter_gradient", {**arguments, **along}, {"moved_gradient": derivative}
+    )
+
+
 def sensitivities(  # noqa: PLR0915
     problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
@@ -82,14 +187,6 @@ def sensitivities(  # noqa: PLR0915
     in_model_units = [scaled["v"] * units[0], scaled["lam"] * units[1]]
     part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
     gradient = ca.gradient(part, symbols["theta"])
-    if "p" in blocks:
-        of_stage = stage_parameter_gradient(problem, blocks, exact=exact)
-        total = ca.SX(0)
-        for k in range(horizon):
-            w = ca.vertcat(y["xi"][:, k], y["v"][:, k]) + ca.DM(problem.reference)
-            curved = [M[:, k * (n + m) : (k + 1) * (n + m)], guess[:, k]] if exact else []
-            total += of_stage(x[:, k], u[:, k], symbols["theta"], w, y["chi"][:, k + 1], *curved)
-        gradient[blocks.slices["p"]] = total
     solution = {name: y[name] for name in SOLUTION} | scaled
     inputs = {**solution, "x": x, "u": u, "theta": symbols["theta"], **extra}
 
@@ -97,7 +194,12 @@ def sensitivities(  # noqa: PLR0915
         """The expression of v and lam in the model's units as one of the scaled ones."""
         return ca.substitute([expression], [y["v"], y["lam"]], in_model_units)[0]
 
-    value = StackedFunction("value_gradient", inputs, {"gradient": of_scaled(gradient)})
+    results = {"gradient": of_scaled(gradient)}
+    if "p" in blocks:
+        # A stage's gradient is a call: written out for each stage, its C takes minutes to compile.
+        value = _value_gradient_by_stages(problem, blocks, inputs, results, exact=exact)
+    else:
+        value = StackedFunction("value_gradient", inputs, results)
 
     @cache
     def policy_jacobian() -> StackedFunction:
@@ -108,7 +210,7 @@ def sensitivities(  # noqa: PLR0915
         )
         dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
         symbol = ca.veccat(*y.values(), *([M] if exact else []))
-        policy, by_state = [], []
+        policy, by_state, moved_stages = [], [], []
         for i in range(m):
             v_i = ca.reshape(dv[:, i], m, horizon)
             lam_i = ca.reshape(dlam[:, i], n, horizon)
@@ -136,12 +238,19 @@ def sensitivities(  # noqa: PLR0915
             )
             policy.append(-of_scaled(ca.jtimes(gradient, symbol, direction)))
             by_state.append(-chi_i[0] * price * unit)
+            moved_w = ca.vertcat(ca.horzcat(*xi_i[:-1]), v_i) * ca.repmat(
+                ca.DM(scale.both) * unit, 1, horizon
+            )
+            moved_chi = ca.horzcat(*chi_i[1:]) * ca.repmat(price * unit, 1, horizon)
+            moved_stages.append((moved_w, moved_chi))
         moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
-        return StackedFunction(
-            "policy_jacobian",
-            {**inputs, **moved, **({"dM": dM} if exact else {})},
-            {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)},
-        )
+        arguments = {**inputs, **moved, **({"dM": dM} if exact else {})}
+        results = {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)}
+        if "p" in blocks:
+            return _policy_jacobian_by_stages(
+                problem, blocks, arguments, results, moved_stages, exact=exact
+            )
+        return StackedFunction("policy_jacobian", arguments, results)
 
     return value, policy_jacobian
 

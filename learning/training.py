@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from controllers import compile_functions
 from controllers.factories import nmpc
@@ -349,8 +350,14 @@ def run_training(
         # Before the work: a folder that cannot be written costs no run.
         for name in (LOG, PARAMETERS, CHECKPOINT):
             check_target(folder / name)
-    # Two plants: an evaluation must not touch the one that is learned from.
-    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
+    with (
+        # The rules' matrices are small: a second thread of BLAS spins for longer than it computes,
+        # and a model-based training took twice its processor time.
+        threadpool_limits(limits=1, user_api="blas"),
+        # Two plants: an evaluation must not touch the one that is learned from.
+        FmuPlant(run.scenario) as plant,
+        FmuPlant(run.scenario) as evaluation_plant,
+    ):
         session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
         compile_functions(session.loop.controller, run.samples)
         if resume:

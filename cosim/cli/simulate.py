@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,8 +41,6 @@ def simulate(
         controller: naive, tuned, backed-off, cautious, lqr, pi, converged, optimal, a parameters
             file, or module:factory.
     """
-    # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to it.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with cli.output(json) as out_:
         from cosim.core.errors import PlantError
         from cosim.core.files import staged

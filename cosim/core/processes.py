@@ -300,7 +300,8 @@ def watch(suspect: str) -> None:
         # Pass on the import path: a folder of the user's may have the name of a package.
         program = (
             f"import sys; sys.path[:] = {sys.path}; from cosim import cli; "
-            f"from cosim.core import processes; processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"
+            "from cosim.core import processes; "
+            f"processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"
         )
         words = [sys.executable, *flags, "-c", program, *sys.argv[1:]]
         child = subprocess.Popen(words, stdout=(*_stdout, None)[0])

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
 from controllers.functions import c_source, not_in_c, work_sizes
-from controllers.preparation import RESIDUAL, Exact, SampleFunctions
+from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.scenario import Scenario
@@ -152,7 +152,7 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         arrays="\n".join(_array(name, values) for name, values in arrays.items()),
         end_discount=repr(float(problem.discounts[-1])),
         floor=repr(Exact.FLOOR),
-        residual=repr(RESIDUAL),
+        residual=repr(SOLVED_RESIDUAL),
         cost_scale=repr(problem.scale.cost),
         rule=made.hessian.source,
         solver=SOLVERS[stagewise][0],

@@ -23,7 +23,7 @@ from controllers.export.core import (
     why_not_in_c,
 )
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
-from controllers.preparation import RESIDUAL, Exact, SampleFunctions, Spectrum
+from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions, Spectrum
 from controllers.problem import Problem
 from controllers.qp import (
     QpBackend,
@@ -34,7 +34,7 @@ from controllers.qp import (
     polish,
 )
 from controllers.sensitivities import (
-    SOLUTION,
+    SOLUTION_PARTS,
     adjoint_directions,
     curvature_directions,
     sensitivities,
@@ -263,7 +263,7 @@ class RtiSolution:
 
     def _write_solution(self, function: StackedFunction) -> None:
         inputs, prepared = function.inputs, self.prepared
-        for name in SOLUTION:
+        for name in SOLUTION_PARTS:
             inputs[name][:] = self._part(name)
         for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
@@ -727,10 +727,10 @@ class RtiNmpc:
         residual = self._read(found, a is not None)
         if not residual <= ACCURATE:
             residual = self._read(polish(qp, found), a is not None)
-        if not residual <= RESIDUAL:
+        if not residual <= SOLVED_RESIDUAL:
             raise QpError(
                 f"the QP was solved too inaccurately: its KKT residual is {residual:.1e}, more "
-                f"than {RESIDUAL:g}; is the model unstable over so long a horizon?",
+                f"than {SOLVED_RESIDUAL:g}; is the model unstable over so long a horizon?",
                 status=INACCURATE,
                 qp=qp.copy(),
             )

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from controllers.dynamic_programming import (
     Accuracy,
     BellmanOperator,
-    Figure,
+    Estimate,
     Grid,
     Optimum,
     Progress,
@@ -129,7 +129,7 @@ def read_optimum(path: Path, key: str) -> Optimum:
             accuracy=Accuracy(int(accuracy["substeps"]), nodes, penalty_nodes),
             lower=lower,
             upper=upper,
-            certificate=tuple(Figure(**figure) for figure in figures or ()),
+            certificate=tuple(Estimate(**figure) for figure in figures or ()),
         )
     except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
         raise OptimumError(

@@ -435,15 +435,19 @@ class Engine:
         self._n_theta = functions.blocks.size
 
     @classmethod
-    def compile(cls, functions: NmpcFunctions) -> Engine | None:
+    def compile(cls, functions: NmpcFunctions, stagewise: bool | None = None) -> Engine | None:
         """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
-        A QP of many stages, or too large for an exported controller, is solved stage by stage.
+        Args:
+            functions: The controller's functions, in whose memory the engine works.
+            stagewise: Whether the QP is solved stage by stage. None leaves it to a rule: one of
+                many stages is, and one too large for an exported controller.
         """
-        problem = functions.problem
-        # A rule of thumb: where stage by stage becomes faster depends on the plant and on θ.
-        stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
-        stagewise = stagewise or stack_needed(functions) > STACK_LIMIT
+        if stagewise is None:
+            problem = functions.problem
+            # A rule of thumb: where this becomes faster depends on the plant and on θ.
+            long = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
+            stagewise = long or stack_needed(functions) > STACK_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +13,7 @@ from controllers.qp import NOT_CONVEX, QpBackend
 from controllers.rti import RtiNmpc
 from controllers.rti.nmpc import RtiSolution
 from controllers.theta import Parameters
+from cosim.core.protocols import Matrix
 
 
 class ConvergedNmpc(RtiNmpc):
@@ -23,9 +22,15 @@ class ConvergedNmpc(RtiNmpc):
     Q, V, π and their sensitivities are those of the nonlinear programme (paper.tex, Sensitivities
     of Fully Converged NMPC): at the solution the QP with the exact Hessian has the programme's KKT
     matrix. SQP on that QP converges quadratically; where it is not convex the Hessian is lifted.
-    Every step is a full one. `tolerance` is on the largest change of states, actions and, relative
-    to 1 + ‖χ‖∞, costates, all in units of `Problem.scale`; QpError where `iterations` do not reach
-    it.
+    Every step is a full one.
+
+    Args:
+        problem: The control problem.
+        parameters: θ.
+        backend: As `RtiNmpc` takes it.
+        tolerance: Largest change of states, actions and, relative to 1 + ‖χ‖∞, costates in a step,
+            all in units of `Problem.scale`, below which the programme counts as solved.
+        iterations: Most steps; where they do not reach the tolerance a feedback raises QpError.
     """
 
     name = "converged"
@@ -41,7 +46,8 @@ class ConvergedNmpc(RtiNmpc):
         tolerance: float = 1e-10,
         iterations: int = 100,
     ) -> None:
-        self._tolerance, self._patience = tolerance, iterations
+        self._tolerance = tolerance
+        self._max_iterations = iterations
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
     def _linearise(self) -> None:
@@ -68,37 +74,48 @@ class ConvergedNmpc(RtiNmpc):
         return super()._solve_qp(s, a)
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
-        scale = self.problem.scale
         solution = self._solve_qp(s, a)
-        for _ in range(self._patience):
-            before, last = self._costates.copy(), solution
+        for _ in range(self._max_iterations):
+            last = solution
+            last_costates = self._costates.copy()
             self._linearise_at(solution.unshifted)
             solution = self._solve_qp(s, a)
-            states = (solution.predicted_states - last.predicted_states) / scale.state
-            actions = (solution.predicted_actions - last.predicted_actions) / scale.action
-            costates = (solution.costates[1:] - self._costates) / scale.state_price
-            size = 1 + float(np.abs(before / scale.state_price).max())
-            change = max(
-                float(np.abs(states).max()),
-                float(np.abs(actions).max()),
-                float(np.abs(costates).max()) / size,
-            )
+            change = self._change(solution, last, last_costates)
             if change < self._tolerance:
-                return self._read_out(s, a, solution) if self._hessian.lifts else solution
+                return self._read_unlifted(a, solution) if self._hessian.lifts else solution
         raise QpError(
-            f"SQP did not converge in {self._patience} iterations at "
+            f"SQP did not converge in {self._max_iterations} iterations at "
             f"s = {solution.predicted_states[0]}; the last change was {change:.1e} of the ranges",
             status="not converged",
             qp=solution.qp.copy(),
         )
 
-    def _read_out(self, s: ArrayLike, a: ArrayLike | None, solution: RtiSolution) -> RtiSolution:
-        """Read a lifted QP's solution out of the programme's own QP, which need not be convex."""
-        known: Any = SimpleNamespace(load=lambda qp: None, solve=lambda qp: solution.multipliers)
-        backend, self._backend = self._backend, known
+    def _change(self, solution: RtiSolution, last: RtiSolution, last_costates: Matrix) -> float:
+        """Largest change of a step's solution, without a unit; see the class."""
+        scale = self.problem.scale
+        states = (solution.predicted_states - last.predicted_states) / scale.state
+        actions = (solution.predicted_actions - last.predicted_actions) / scale.action
+        costates = (solution.costates[1:] - self._costates) / scale.state_price
+        size = 1 + float(np.abs(last_costates / scale.state_price).max())
+        return max(
+            float(np.abs(states).max()),
+            float(np.abs(actions).max()),
+            float(np.abs(costates).max()) / size,
+        )
+
+    def _read_unlifted(self, a: ArrayLike | None, solution: RtiSolution) -> RtiSolution:
+        """Read a lifted QP's solution out of the programme's own QP, which need not be convex.
+
+        At the solution of the programme both have the same primal-dual solution, but derivatives
+        are those of the programme only with its own Hessian. A solver could not take that QP, and
+        needs not: its solution is known.
+        """
         try:
-            self._linearise_at(solution.unshifted)
-            return super()._solve_qp(s, a)
+            self._hessian.lifts = False
+            self._x[:], self._u[:], self._costates[:] = solution.unshifted
+            self._make_qp()
+            self._embed_state(None if a is None else np.asarray(a, dtype=np.float64))
+            self._accept(solution.multipliers, enforced=a is not None)
+            return self._solution(self._keep_preparation(None), enforced=a is not None)
         finally:
-            self._backend = backend
             self._linearise_as(lifts=True)

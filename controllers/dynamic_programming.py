@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 Indices = NDArray[np.intp]
-POINTS = 4
+CUBIC_POINTS = 4
+"""Points of an axis that a cubic goes through."""
 
 
 class AxisInterpolant:
@@ -39,31 +40,53 @@ class AxisInterpolant:
 
     def __init__(self, axis: Array, smooth: tuple[float, float] | None) -> None:
         cells = np.arange(len(axis) - 1)
-        lower, upper = smooth or (np.inf, -np.inf)
-        tolerance = 1e-9 * (axis[-1] - axis[0])
-        cubic = (axis[:-1] >= lower - tolerance) & (axis[1:] <= upper + tolerance)
-        count = POINTS if cubic.sum() >= POINTS - 1 else 2
+        if smooth is None:
+            cubic = np.zeros(len(cells), dtype=bool)
+        else:
+            tolerance = 1e-9 * (axis[-1] - axis[0])
+            cubic = axis[:-1] >= smooth[0] - tolerance
+            cubic &= axis[1:] <= smooth[1] + tolerance
+        any_cubic = cubic.sum() >= CUBIC_POINTS - 1
+        count = CUBIC_POINTS if any_cubic else 2
+
+        # The stencil is about the cell, but within the axis, and a cubic's within the smooth part.
         first = np.clip(cells - (count // 2 - 1), 0, len(axis) - count)
-        if count == POINTS:
+        if any_cubic:
             within = np.flatnonzero(cubic)
-            first[cubic] = np.clip(first[cubic], within[0], within[-1] + 2 - POINTS)
+            first[cubic] = np.clip(first[cubic], within[0], within[-1] + 2 - CUBIC_POINTS)
+
         weights = np.zeros((count, count, len(cells)))
         for c in cells:
-            start, points = (first[c], POINTS) if count == POINTS and cubic[c] else (c, 2)
-            for j in range(start, start + points):
-                polynomial = np.ones(1)
-                for k in range(start, start + points):
-                    if k != j:
-                        step = axis[j] - axis[k]
-                        polynomial = np.convolve(polynomial, [(axis[c] - axis[k]) / step, 1 / step])
+            if any_cubic and cubic[c]:
+                points = range(first[c], first[c] + CUBIC_POINTS)
+            else:
+                points = range(c, c + 2)
+            for j in points:
+                polynomial = _lagrange_polynomial(axis, j, points, axis[c])
                 weights[: len(polynomial), j - first[c], c] = polynomial
-        self.axis, self.first, self.weights = axis, first, weights
+        self.axis = axis
+        self.first = first
+        self.weights = weights
 
     def locate(self, x: Array) -> tuple[Indices, Array]:
         """Cells of coordinates and offsets in them; outside the axis, those of its ends."""
         inside = np.clip(x, self.axis[0], self.axis[-1])
         cell = np.searchsorted(self.axis[1:-1], inside, side="right")
         return cell, inside - self.axis[cell]
+
+
+def _lagrange_polynomial(axis: Array, j: int, points: Sequence[int], origin: float) -> Array:
+    """Coefficients, in powers of x − origin, of the polynomial that is 1 at axis[j], 0 at others.
+
+    The others are the points of the axis with the indices `points`.
+    """
+    polynomial = np.ones(1)
+    for k in points:
+        if k != j:
+            width = axis[j] - axis[k]
+            factor = [(origin - axis[k]) / width, 1 / width]
+            polynomial = np.convolve(polynomial, factor)
+    return polynomial
 
 
 @dataclass(frozen=True)
@@ -105,15 +128,16 @@ class Grid:
         for interpolant, axis, values in zip(self._interpolants, self.axes, x, strict=True):
             cell, offset = interpolant.locate(values)
             first = interpolant.first[cell]
-            own = [
-                (first + j, _horner(interpolant.weights[:, j], cell, [offset]))
-                for j in range(interpolant.weights.shape[1])
-            ]
-            corners = [
-                (index * len(axis) + position, weight * factor)
-                for index, weight in corners
-                for position, factor in own
-            ]
+            # Each corner so far has one successor for each point of this axis' stencil.
+            stencil = []
+            for j in range(interpolant.weights.shape[1]):
+                factor = _horner(interpolant.weights[:, j], cell, [offset])
+                stencil.append((first + j, factor))
+            extended = []
+            for index, weight in corners:
+                for position, factor in stencil:
+                    extended.append((index * len(axis) + position, weight * factor))
+            corners = extended
         return corners
 
     def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
@@ -145,6 +169,7 @@ class Grid:
 
 
 def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
+    """Polynomial in `offsets` of the coefficients `table[i, j, …, index]`, by Horner's rule."""
     if not offsets:
         return np.asarray(table[index])
     first, *rest = offsets
@@ -162,6 +187,11 @@ def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: flo
     """Axis through all `marks`, dense at features, each cell outwards about `growth` times wider.
 
     The width of a cell at x is the least over the features of spacing + (growth − 1)·distance.
+
+    Args:
+        marks: Points of the axis, increasing: the first and last ones are its ends.
+        features: Where the axis is dense.
+        growth: Ratio of the widths of neighbouring cells, above 1.
     """
     parts = []
     for lower, upper in pairwise(marks):
@@ -171,6 +201,8 @@ def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: flo
         for first, last, spacing in features:
             distance = np.maximum(np.maximum(first - middle, middle - last), 0.0)
             np.minimum(width, spacing + (growth - 1.0) * distance, out=width)
+        # Number of cells from `lower` to each point; the axis has the points of whole numbers,
+        # after that count is rounded up to one.
         count = np.append(0.0, np.cumsum(np.diff(fine) / width))
         cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
         inner = np.interp(np.arange(1, cells) * (count[-1] / cells), count, fine)
@@ -183,11 +215,17 @@ def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> tuple[list[Array
 
     Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one, one node for a disturbance
     that does not vary. Exact for polynomials of degree 2·count−1 in each; the weights sum to 1.
+
+    Args:
+        law: Law of the disturbances.
+        counts: Number of nodes of each.
     """
-    axes, weights = [], np.ones(1)
+    axes = []
+    weights = np.ones(1)
     for count, nominal, spread in zip(counts, law.nominal, law.ranges, strict=True):
         if law.kind == "none" or spread == 0:
-            x, w = np.zeros(1), np.ones(1)
+            x = np.zeros(1)
+            w = np.ones(1)
         elif law.kind == "uniform":
             x, w = np.polynomial.legendre.leggauss(count)
         else:
@@ -215,7 +253,8 @@ class Refinement:
 
     def __call__(self, values: Array) -> Array:
         """Carry values (B, q_coarse) to (B, q_fine)."""
-        count, right = len(values), 1
+        count = len(values)
+        right = 1  # size of the axes that are fine already
         for matrix in reversed(self._matrices):
             fine, coarse = matrix.shape
             if right == 1:
@@ -226,6 +265,7 @@ class Refinement:
         return values.reshape(count, -1)
 
 
+# NumPy's counterparts of CasADi's elementary operations, by their codes.
 _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_ASSIGN: lambda a: a,
     ca.OP_ADD: operator.add,
@@ -246,15 +286,13 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_AND: lambda a, b: np.where((a != 0) & (b != 0), 1.0, 0.0),
     ca.OP_OR: lambda a, b: np.where((a != 0) | (b != 0), 1.0, 0.0),
     ca.OP_IF_ELSE_ZERO: lambda a, b: np.where(a != 0, b, 0.0),
-    **{
-        getattr(ca, f"OP_{name.upper()}"): getattr(np, name)
-        for name in (
-            *("exp", "log", "log1p", "expm1", "sqrt", "hypot", "sign", "floor", "ceil"),
-            *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
-            *("fabs", "fmin", "fmax"),
-        )
-    },
 }
+for _name in (
+    *("exp", "log", "log1p", "expm1", "sqrt", "hypot", "sign", "floor", "ceil"),
+    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
+    *("fabs", "fmin", "fmax"),
+):
+    _OPERATIONS[getattr(ca, f"OP_{_name.upper()}")] = getattr(np, _name)
 
 
 class Elementwise:
@@ -322,9 +360,9 @@ class Accuracy:
     def draft(self) -> Accuracy:
         """A quarter of the work, for grids that only give a start."""
         return Accuracy(
-            max(self.substeps // 2, 1),
-            tuple(min(count, 5) for count in self.nodes),
-            tuple(min(count, 10) for count in self.penalty_nodes),
+            substeps=max(self.substeps // 2, 1),
+            nodes=tuple(min(count, 5) for count in self.nodes),
+            penalty_nodes=tuple(min(count, 10) for count in self.penalty_nodes),
         )
 
 
@@ -336,12 +374,13 @@ class BellmanOperator:
     """
 
     def __init__(self, plant: PlantProblem, accuracy: Accuracy, *, workers: int = 1) -> None:
-        problem, law = plant.problem, plant.law
-        self.problem, self.deterministic = problem, law.kind == "none" or not law.ranges.any()
+        problem = plant.problem
+        law = plant.law
+        self.problem = problem
+        self.deterministic = law.kind == "none" or not law.ranges.any()
         self.accuracy = accuracy
-        self._step = Elementwise(
-            discretise(problem.model, problem.sampling_time, accuracy.substeps)
-        )
+        step = discretise(problem.model, problem.sampling_time, accuracy.substeps)
+        self._step = Elementwise(step)
         self._cost = Elementwise(economic_cost(problem.model))
         self._parameters = plant.parameters
         nodes, self._weights = gauss_rule(law, accuracy.nodes)
@@ -351,15 +390,29 @@ class BellmanOperator:
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
 
     def deviation(self, state: Array, action: Array) -> Array:
-        """Standard deviation of the next state from (state, action), shape (n,)."""
+        """Standard deviation of the next state.
+
+        Args:
+            state: Present state, (n,).
+            action: Action, (m,).
+
+        Returns:
+            One deviation a state, (n,).
+        """
         _, x_next = self._expected_cost(state[None, :], action[None, :])
         x = np.concatenate(x_next)
         variance = (x * x) @ self._weights - (x @ self._weights) ** 2
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def values(self, states: Array, actions: Array, grid: Grid, W: Array) -> Array:
-        """Q at states (B, n) and actions (B, m) for W (G,) on the grid; shape (B,)."""
+        """Q(s, a), shape (B,).
 
+        Args:
+            states: States, (B, n).
+            actions: Actions, (B, m).
+            grid: The grid.
+            W: Smooth part of the value on the grid, (G,).
+        """
         smooth = grid.interpolant(W)
 
         def values_of(part: slice) -> Array:
@@ -369,9 +422,14 @@ class BellmanOperator:
         return np.concatenate(list(self._map(values_of, len(states))))
 
     def chain(self, actions: Array, grid: Grid) -> tuple[sparse.csr_array, Array]:
-        """Markov chain of a policy (G, m) on the grid: transition matrix (G, G), cost (G,).
+        """Markov chain of a policy on the grid.
 
-        The cost is E[ℓ + penalty(s₊)].
+        Args:
+            actions: The policy at each of the grid's states, (G, m).
+            grid: The grid.
+
+        Returns:
+            The transition matrix (G, G), and the cost E[ℓ + penalty(s₊)] of each state, (G,).
         """
         from scipy import sparse  # noqa: PLC0415
 
@@ -381,15 +439,13 @@ class BellmanOperator:
             rows = np.repeat(np.arange(count), nodes)
             matrix = sparse.csr_array((count, grid.size))
             for index, weight in grid.weights(x_next):
-                data = (weight * self._weights).reshape(-1)
-                matrix += sparse.csr_array(
-                    (data, (rows, index.reshape(-1))), shape=(count, grid.size)
-                )
+                entries = (weight * self._weights).reshape(-1)
+                places = (rows, index.reshape(-1))
+                matrix += sparse.csr_array((entries, places), shape=(count, grid.size))
             return matrix, cost
 
-        found = list(self._map(rows_of, grid.size))
-        matrix = sparse.vstack([rows for rows, _ in found], format="csr")
-        return matrix, np.concatenate([cost for _, cost in found])
+        matrices, costs = zip(*self._map(rows_of, grid.size), strict=True)
+        return sparse.vstack(matrices, format="csr"), np.concatenate(costs)
 
     def _expected_cost(self, states: Array, actions: Array) -> tuple[Array, list[Array]]:
         """E[ℓ + penalty(s₊)], shape (B,), and s₊ at the nodes, n arrays (B, q)."""
@@ -405,27 +461,36 @@ class BellmanOperator:
         return cost + self._expected_penalty(x_next), x_next
 
     def _expected_penalty(self, x_next: Sequence[Array]) -> Array:
+        """E[penalty(s₊)], shape (B,), of s₊ at the nodes, n arrays (B, q)."""
         total = np.zeros(len(x_next[0]))
-        problem = self.problem
         for i, x in enumerate(x_next):
-            lowest, highest = x.min(axis=1), x.max(axis=1)
+            lowest = x.min(axis=1)
+            highest = x.max(axis=1)
             # The outermost Gauss nodes lie inside the law's support.
             reach = 0.25 * (highest - lowest)
-            for sign, extreme, bound in (
-                (-1.0, lowest - reach, problem.state_lower[i]),
-                (1.0, highest + reach, problem.state_upper[i]),
-            ):
-                near = np.flatnonzero(sign * (extreme - bound) > 0)
-                if len(near):
-                    violation = np.maximum(sign * (self._refine(x[near]) - bound), 0.0)
-                    penalty = (
-                        problem.penalty_linear[i] + problem.penalty_quadratic[i] * violation
-                    ) * violation
-                    total[near] += _mean(penalty, self._penalty_weights)
+            below = np.flatnonzero(-(lowest - reach - self.problem.state_lower[i]) > 0)
+            if len(below):
+                total[below] += self._expected_bound_penalty(x[below], i, -1.0)
+            above = np.flatnonzero(highest + reach - self.problem.state_upper[i] > 0)
+            if len(above):
+                total[above] += self._expected_bound_penalty(x[above], i, 1.0)
         return total
 
+    def _expected_bound_penalty(self, x: Array, i: int, sign: float) -> Array:
+        """Expected penalty of one bound of state i, whose values are x (B, q) at the nodes.
+
+        The bound is the upper one for `sign` 1, the lower one for −1. A state is smooth in the
+        disturbances, so it is carried to the many nodes that the penalty's kink needs.
+        """
+        problem = self.problem
+        bound = problem.state_upper[i] if sign > 0 else problem.state_lower[i]
+        violation = np.maximum(sign * (self._refine(x) - bound), 0.0)
+        slope = problem.penalty_linear[i] + problem.penalty_quadratic[i] * violation
+        return _mean(slope * violation, self._penalty_weights)
+
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
-        tasks = -(-count * len(self._weights) // _ENTRIES)
+        """Results of a task for slices of `count` states, by the threads where there are any."""
+        tasks = -(-count * len(self._weights) // _ENTRIES)  # rounded up
         edges = np.linspace(0, count, min(tasks, count) + 1).astype(int)
         parts = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
         return self._pool.map(task, parts) if self._pool else map(task, parts)
@@ -461,10 +526,13 @@ class Settings:
     def accuracy(self, plant: PlantProblem) -> Accuracy:
         """Integrator and quadrature for a problem."""
         count = len(plant.law.nominal)
+        # The first two disturbances move the state most.
+        nodes = (7, 7, *(2,) * count)[:count]
+        penalty_nodes = (20, 20, 4, *(2,) * count)[:count]
         return Accuracy(
-            accurate_substeps(plant, self.integration_tolerance),
-            self.nodes or (7, 7, *(2,) * count)[:count],
-            self.penalty_nodes or (20, 20, 4, *(2,) * count)[:count],
+            substeps=accurate_substeps(plant, self.integration_tolerance),
+            nodes=self.nodes or nodes,
+            penalty_nodes=self.penalty_nodes or penalty_nodes,
         )
 
 
@@ -472,27 +540,33 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     """Least power of two of RK4 substeps whose doubling moves no next state by more than allowed.
 
     Allowed is `tolerance`·(1 + |x|) at 2000 points: states within a quarter of the bounds' span of
-    the reference, actions in their box, disturbances of the law. Raises OptimumError where 128
-    substeps are too few.
+    the reference, actions in their box, disturbances of the law.
+
+    Args:
+        plant: The plant's model with its law and parameters.
+        tolerance: What is allowed, relative to 1 + |x|.
+
+    Raises:
+        OptimumError: 128 substeps are too few.
     """
-    problem, generator = plant.problem, np.random.default_rng(0)
+    problem = plant.problem
+    generator = np.random.default_rng(0)
+    count = 2000
     reach = 0.25 * (problem.state_upper - problem.state_lower)
-    x = generator.uniform(
-        np.maximum(problem.state_lower, problem.reference_state - reach),
-        np.minimum(problem.state_upper, problem.reference_state + reach),
-        (2000, problem.n_states),
-    )
-    u = generator.uniform(problem.action_lower, problem.action_upper, (2000, problem.n_actions))
-    d = plant.law.draw(generator, 2000)
+    lower = np.maximum(problem.state_lower, problem.reference_state - reach)
+    upper = np.minimum(problem.state_upper, problem.reference_state + reach)
+    x = generator.uniform(lower, upper, (count, problem.n_states))
+    u = generator.uniform(problem.action_lower, problem.action_upper, (count, problem.n_actions))
+    d = plant.law.draw(generator, count)
     before: Array | None = None
     for substeps in 2 ** np.arange(8):
         step = Elementwise(discretise(problem.model, problem.sampling_time, int(substeps)))
         # A step that is too long may overflow; then the next one is tried.
         with np.errstate(all="ignore"):
             entries = step(x.T, u.T, d.T, plant.parameters)
-            x_next = np.stack([np.broadcast_to(entry, 2000) for entry in entries], axis=1)
-            moved = np.inf if before is None else np.abs(x_next - before)
-        if np.all(moved <= tolerance * (1 + np.abs(x))):
+            x_next = np.stack([np.broadcast_to(entry, count) for entry in entries], axis=1)
+            change = np.inf if before is None else np.abs(x_next - before)
+        if np.all(change <= tolerance * (1 + np.abs(x))):
             return int(substeps)
         before = x_next
     raise OptimumError(
@@ -506,6 +580,11 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
 
     At the reference and at the bounds, where the optimal closed loop may live, its cells are half a
     standard deviation of one sample's disturbance wide.
+
+    Args:
+        problem: The problem with its bounds and reference.
+        operator: The Bellman operator, which knows the disturbance's effect on a state.
+        settings: The solver's settings.
     """
     deviation = operator.deviation(problem.reference_state, problem.reference_action)
     axes = []
@@ -523,7 +602,7 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
 
 def refined(
     operator: BellmanOperator,
-    found: Optimum,
+    optimum: Optimum,
     settings: Settings,
     level: int,
     *,
@@ -534,41 +613,80 @@ def refined(
     At a bound that the closed loop touches the cells are 2^-level of the standard deviation of one
     sample's disturbance, which alone smooths the penalty's kink. The grid extends beyond the
     support by the support's width, and at least by a twentieth of the bounds' span; without
-    disturbance it keeps its box. `smooth`: cubic interpolation within the support.
+    disturbance it keeps its box.
+
+    Args:
+        operator: The Bellman operator.
+        optimum: The policy on a coarser grid, with its stationary distribution.
+        settings: The solver's settings.
+        level: The new grid's level.
+        smooth: Whether interpolation is cubic within the support.
+
+    Returns:
+        The policy, interpolated linearly, with its value on the new grid.
     """
     problem = operator.problem
-    span = problem.state_upper - problem.state_lower
-    grid, mass = found.grid, np.maximum(found.distribution, 0.0)
-    mean = mass @ np.column_stack([grid.points, found.actions]) / mass.sum()
+    grid = optimum.grid
+    mass = np.maximum(optimum.distribution, 0.0)
+    mean = mass @ np.column_stack([grid.points, optimum.actions]) / mass.sum()
     deviation = operator.deviation(mean[: problem.n_states], mean[problem.n_states :])
     mass = mass.reshape(grid.shape)
-    axes, intervals = [], []
+    axes = []
+    intervals = []
     for i, axis in enumerate(grid.axes):
         others = tuple(j for j in range(mass.ndim) if j != i)
-        # The interval that holds all but `tail` of the mass at each end, and a cell on either side.
-        cumulative = np.cumsum(mass.sum(axis=others)) / mass.sum(axis=others).sum()
-        ends = np.searchsorted(cumulative, (settings.tail, 1.0 - settings.tail))
-        first, last = axis[max(ends[0] - 1, 0)], axis[min(ends[1] + 1, len(axis) - 1)]
-        reference, width = problem.reference_state[i], last - first
-        features = [(first, last, width / (settings.cells * 2**level))]
-        bounds = [
-            bound
-            for bound in (problem.state_lower[i], problem.state_upper[i])
-            if first - deviation[i] <= bound <= last + deviation[i]
-        ]
-        near = max(deviation[i], 1e-3 * span[i])
-        features += [(b - near, b + near, near / 2**level) for b in bounds]
-        beyond = max(width, (1.0 if operator.deterministic else 0.05) * span[i])
-        low = max(axis[0], min(first, reference) - beyond)
-        high = min(axis[-1], max(last, reference) + beyond)
-        marks = [low, *(x for x in sorted({*bounds, reference}) if low < x < high), high]
-        axes.append(graded_axis(marks, features, settings.growth))
+        support = _support(axis, mass.sum(axis=others), settings.tail)
+        axes.append(_refined_axis(operator, settings, level, i, axis, support, deviation[i]))
         # Beyond a bound the value has a kink wherever the return takes one more sample.
-        intervals.append((max(first, problem.state_lower[i]), min(last, problem.state_upper[i])))
+        first = max(support[0], problem.state_lower[i])
+        last = min(support[1], problem.state_upper[i])
+        intervals.append((first, last))
     finer = Grid(tuple(axes), tuple(intervals) if smooth else None)
-    states, linear = list(finer.points.T), Grid(grid.axes)
-    actions = [linear.interpolant(column)(states) for column in found.actions.T]
-    return begin(operator, finer, np.stack(actions, axis=1), 0.1)
+
+    states = list(finer.points.T)
+    linear = Grid(grid.axes)
+    actions = [linear.interpolant(column)(states) for column in optimum.actions.T]
+    return start_policy(operator, finer, np.stack(actions, axis=1), 0.1)
+
+
+def _support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:
+    """Interval that holds all but `tail` of the mass at each end, and a cell on either side."""
+    cumulative = np.cumsum(mass) / mass.sum()
+    ends = np.searchsorted(cumulative, (tail, 1.0 - tail))
+    first = max(ends[0] - 1, 0)
+    last = min(ends[1] + 1, len(axis) - 1)
+    return axis[first], axis[last]
+
+
+def _refined_axis(
+    operator: BellmanOperator,
+    settings: Settings,
+    level: int,
+    i: int,
+    axis: Array,
+    support: tuple[float, float],
+    deviation: float,
+) -> Array:
+    """Axis of state i on a grid of `level`; `deviation` is that of a sample's disturbance in it."""
+    problem = operator.problem
+    reference = problem.reference_state[i]
+    span = problem.state_upper[i] - problem.state_lower[i]
+    first, last = support
+    width = last - first
+    features = [(first, last, width / (settings.cells * 2**level))]
+    touched = []
+    near = max(deviation, 1e-3 * span)
+    for bound in (problem.state_lower[i], problem.state_upper[i]):
+        if first - deviation <= bound <= last + deviation:
+            touched.append(bound)
+            features.append((bound - near, bound + near, near / 2**level))
+
+    # Without disturbance a state that strays never comes into the support's mass: keep the box.
+    beyond = max(width, (1.0 if operator.deterministic else 0.05) * span)
+    low = max(axis[0], min(first, reference) - beyond)
+    high = min(axis[-1], max(last, reference) + beyond)
+    inside = [x for x in sorted({*touched, reference}) if low < x < high]
+    return graded_axis([low, *inside, high], features, settings.growth)
 
 
 Objective = Callable[[Indices, Array], Array]
@@ -586,20 +704,31 @@ def nelder_mead(
 ) -> tuple[Array, Array]:
     """Minimise B functions of m variables in a box, each from its own start.
 
-    `objective(rows, points)` evaluates functions `rows` (r,) at points (r, m); `start` (B, m);
-    `size` (B, m) is the first simplex's edge; a function is done when its simplex's values lie
-    within `precision` of each other. Returns minimisers (B, m) and values (B,), never worse than
-    the start. Nelder and Mead (1965), projected on the box; SciPy's minimises one function at a
-    time. The expected penalty of a nearly deterministic plant has no derivative.
+    Nelder and Mead (1965), projected on the box; SciPy's minimises one function at a time. The
+    expected penalty of a nearly deterministic plant has no derivative.
+
+    Args:
+        objective: `objective(rows, points)` evaluates functions `rows` (r,) at points (r, m).
+        start: Starts, (B, m).
+        size: Edges of the first simplices, (B, m).
+        lower: Lower bounds of the box, (m,).
+        upper: Upper bounds, (m,).
+        iterations: Most iterations.
+        precision: A function is done when its simplex's values lie so close to each other.
+
+    Returns:
+        Minimisers (B, m) and values (B,), never worse than the start.
     """
     count, m = start.shape
     everyone = np.arange(count)
     vertices = np.repeat(np.clip(start, lower, upper)[:, None], m + 1, axis=1)
     for i in range(m):
-        moved = vertices[:, i + 1, i] + size[:, i]
-        inward = np.where(moved > upper[i], vertices[:, i + 1, i] - size[:, i], moved)
+        vertex = vertices[:, i + 1, i]
+        outward = vertex + size[:, i]
+        inward = np.where(outward > upper[i], vertex - size[:, i], outward)
         vertices[:, i + 1, i] = np.clip(inward, lower[i], upper[i])
     values = np.stack([objective(everyone, vertices[:, i]) for i in range(m + 1)], axis=1)
+
     for _ in range(iterations):
         order = np.argsort(values, axis=1, kind="stable")
         values = np.take_along_axis(values, order, axis=1)
@@ -607,28 +736,35 @@ def nelder_mead(
         rows = np.flatnonzero(values[:, -1] - values[:, 0] > precision)
         if not len(rows):
             break
-        centre, worst = vertices[rows, :-1].mean(axis=1), vertices[rows, -1]
+
+        centre = vertices[rows, :-1].mean(axis=1)
+        worst = vertices[rows, -1]
         candidate = np.clip(2.0 * centre - worst, lower, upper)
         reflected = objective(rows, candidate)
-        best = reflected < values[rows, 0]
-        accepted = reflected < values[rows, -2]
+        is_best = reflected < values[rows, 0]
+        is_accepted = reflected < values[rows, -2]
+
         # Expansion, outside contraction and inside contraction as multiples of centre − worst.
-        factor = np.where(best, 2.0, np.where(reflected < values[rows, -1], 0.5, -0.5))
+        contraction = np.where(reflected < values[rows, -1], 0.5, -0.5)
+        factor = np.where(is_best, 2.0, contraction)
         trial = np.clip(centre + factor[:, None] * (centre - worst), lower, upper)
-        tried = np.flatnonzero(best | ~accepted)
+        tried = np.flatnonzero(is_best | ~is_accepted)
         outcome = np.full(len(rows), np.inf)
         if len(tried):
             outcome[tried] = objective(rows[tried], trial[tried])
         candidate = np.where((outcome < reflected)[:, None], trial, candidate)
         outcome = np.minimum(outcome, reflected)
+
         improved = outcome < values[rows, -1]
         vertices[rows[improved], -1] = candidate[improved]
         values[rows[improved], -1] = outcome[improved]
+        # What no point improved shrinks towards its best vertex.
         shrinking = rows[~improved]
         for i in range(1, m + 1):
             if len(shrinking):
-                vertices[shrinking, i] = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
-                values[shrinking, i] = objective(shrinking, vertices[shrinking, i])
+                halfway = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
+                vertices[shrinking, i] = halfway
+                values[shrinking, i] = objective(shrinking, halfway)
     best = values.argmin(axis=1)
     return vertices[everyone, best], values[everyone, best]
 
@@ -636,15 +772,28 @@ def nelder_mead(
 def scan(
     objective: Objective, start: Array, lower: Array, upper: Array, points: int
 ) -> tuple[Array, Array]:
-    """Best of `start` (B, m) and a grid of `points` per variable over the box, with its value."""
+    """Best of a start and of a grid over the box, for B functions.
+
+    Args:
+        objective: As `nelder_mead` takes it.
+        start: Starts, (B, m).
+        lower: Lower bounds of the box, (m,).
+        upper: Upper bounds, (m,).
+        points: Number of the grid's points per variable.
+
+    Returns:
+        The best point (B, m) of each function, and its value (B,).
+    """
     everyone = np.arange(len(start))
-    best, values = start.copy(), objective(everyone, start)
+    best = start.copy()
+    values = objective(everyone, start)
     axes = [np.linspace(low, high, points) for low, high in zip(lower, upper, strict=True)]
     for point in itertools.product(*axes):
         candidate = np.broadcast_to(point, start.shape)
-        found = objective(everyone, candidate)
-        better = found < values
-        best[better], values[better] = np.array(point), found[better]
+        outcome = objective(everyone, candidate)
+        better = outcome < values
+        best[better] = np.array(point)
+        values[better] = outcome[better]
     return best, values
 
 
@@ -653,8 +802,8 @@ def scan(
 _RESTART = 1e-9
 
 
-class Figure(NamedTuple):
-    """An estimate of J*: its value and interval [lower, upper]."""
+class Estimate(NamedTuple):
+    """An estimate of J*: how it was made, its value and interval [lower, upper]."""
 
     name: str
     value: float
@@ -680,7 +829,7 @@ class Optimum:
     accuracy: Accuracy
     lower: float = -np.inf
     upper: float = np.inf
-    certificate: tuple[Figure, ...] = ()
+    certificate: tuple[Estimate, ...] = ()
     step: Array = field(default_factory=partial(np.zeros, 0))
 
     @property
@@ -694,10 +843,21 @@ class Optimum:
 def evaluate_policy(
     operator: BellmanOperator, grid: Grid, actions: Array, anchor: int
 ) -> tuple[Array, float, Array]:
-    """Value W (G,), gain and stationary distribution (G,) of a policy (G, m).
+    """Value, gain and stationary distribution of a policy.
 
-    W + g = c + P W with W[anchor] = 0, by one sparse factorisation. Raises OptimumError where the
-    chain cannot be evaluated.
+    W + g = c + P W with W[anchor] = 0, by one sparse factorisation.
+
+    Args:
+        operator: The Bellman operator, which makes the chain P and the cost c.
+        grid: The grid.
+        actions: The policy, (G, m).
+        anchor: Index of the grid state whose value is zero.
+
+    Returns:
+        The smooth part W of the value (G,), the gain, and the distribution (G,).
+
+    Raises:
+        OptimumError: The chain cannot be evaluated.
     """
     from scipy import sparse  # noqa: PLC0415
     from scipy.sparse.linalg import splu  # noqa: PLC0415
@@ -718,8 +878,17 @@ def evaluate_policy(
     return solution[:size], float(solution[size]), distribution
 
 
-def begin(operator: BellmanOperator, grid: Grid, actions: Array, share: float = 1.0) -> Optimum:
-    """Evaluate a first policy (G, m); its `step` is a tenth of the action box times `share`."""
+def start_policy(
+    operator: BellmanOperator, grid: Grid, actions: Array, share: float = 1.0
+) -> Optimum:
+    """Evaluate a first policy; its `step` is a tenth of the action box times `share`.
+
+    Args:
+        operator: The Bellman operator.
+        grid: The grid.
+        actions: The policy, (G, m).
+        share: How far the next improvement looks, as a share of a tenth of the action box.
+    """
     problem = operator.problem
     width = problem.action_upper - problem.action_lower
     W, gain, mass = evaluate_policy(operator, grid, actions, grid.nearest(problem.reference_state))
@@ -730,12 +899,20 @@ def begin(operator: BellmanOperator, grid: Grid, actions: Array, share: float = 
 def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int) -> Optimum:
     """Improve the policy once and bound the remaining gain.
 
-    Each state has a local search from its present action or from a better one of `scan_points`
-    actions per dimension over the box; `lower` is a bound if that finds the global minimum.
-    Returns the improved actions with the value of the former ones and its bounds.
+    Each state has a local search from its present action or from a better one of a scan over the
+    box; `lower` is a bound if that finds the global minimum.
+
+    Args:
+        operator: The Bellman operator.
+        iterate: The present policy with its value.
+        scan_points: Number of actions per dimension that the scan tries.
+
+    Returns:
+        The improved actions with the value of the former ones and its bounds.
     """
-    problem, grid = operator.problem, iterate.grid
-    lower, upper = problem.action_lower, problem.action_upper
+    grid = iterate.grid
+    lower = operator.problem.action_lower
+    upper = operator.problem.action_upper
 
     def objective(rows: Indices, actions: Array) -> Array:
         return operator.values(grid.points[rows], actions, grid, iterate.W)
@@ -743,10 +920,16 @@ def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int
     start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
     width = upper - lower
     size = np.clip(2.0 * np.abs(iterate.step), 2e-3 * width, 0.1 * width)
-    precision = 1e-8 * abs(iterate.gain)
     actions, values = nelder_mead(
-        objective, start, size, lower, upper, iterations=30, precision=precision
+        objective,
+        start,
+        size,
+        lower,
+        upper,
+        iterations=30,
+        precision=1e-8 * abs(iterate.gain),
     )
+    # Odoni (1969): the least and the largest of TW − W enclose the optimal gain.
     residual = values - iterate.W
     return replace(
         iterate,
@@ -761,32 +944,36 @@ Progress = Callable[[int, int, Optimum], None]
 """Called with the grid's level, the round on it and its result."""
 
 
-TOLERANCE = 5e-4
-"""Relative distance within which the figures of a certificate must agree."""
-NEEDED = ("solution", "refinement", "simulation")
+CERTIFICATE_TOLERANCE = 5e-4
+"""Relative distance within which the estimates of a certificate must agree."""
+REQUIRED_ESTIMATES = ("solution", "refinement", "simulation")
 SEARCH = "policy search"
 
 
-def objection(certificate: Sequence[Figure]) -> str | None:
+def objection(certificate: Sequence[Estimate]) -> str | None:
     """Why a certified solution may not be called J*, or None.
 
-    All figures but that of a policy search must agree within `TOLERANCE`.
+    All estimates but that of a policy search must agree within `CERTIFICATE_TOLERANCE`.
     """
-    made = {figure.name: figure for figure in certificate}
-    if missing := [name for name in NEEDED if name not in made]:
+    estimates = {estimate.name: estimate for estimate in certificate}
+    missing = [name for name in REQUIRED_ESTIMATES if name not in estimates]
+    if missing:
         return f"not made: {', '.join(missing)}"
-    search = made.pop(SEARCH, None)
-    values = [figure.value for figure in made.values()]
+    # A search has a bound from above alone: what it finds may be dearer, not cheaper.
+    search = estimates.pop(SEARCH, None)
+    percent = 100 * CERTIFICATE_TOLERANCE
+    values = [estimate.value for estimate in estimates.values()]
     spread = (max(values) - min(values)) / abs(min(values))
-    if spread > TOLERANCE:
-        return f"{', '.join(made)} are {100 * spread:.3f} % apart, more than {100 * TOLERANCE:g} %"
-    allowed = TOLERANCE * abs(values[0])
-    for figure in made.values():
-        if figure.upper - figure.lower > 2 * allowed:
-            return f"the interval of the {figure.name} is wider than {2 * allowed:.3g}"
-    if search is not None and search.upper < made["refinement"].value - allowed:
+    if spread > CERTIFICATE_TOLERANCE:
+        names = ", ".join(estimates)
+        return f"{names} are {100 * spread:.3f} % apart, more than {percent:g} %"
+    allowed = CERTIFICATE_TOLERANCE * abs(values[0])
+    for estimate in estimates.values():
+        if estimate.upper - estimate.lower > 2 * allowed:
+            return f"the interval of the {estimate.name} is wider than {2 * allowed:.3g}"
+    if search is not None and search.upper < estimates["refinement"].value - allowed:
         return (
-            f"a policy search found {search.value:.2f}, more than {100 * TOLERANCE:g} % "
+            f"a policy search found {search.value:.2f}, more than {percent:g} % "
             "below the refinement"
         )
     return None
@@ -801,23 +988,34 @@ def solve(
 ) -> Optimum:
     """Solve for the optimal policy of the stochastic plant by Howard's policy iteration.
 
-    Raises OptimumError where the bounds do not close to 1 % of the gain, or where the closed loop
-    leaves the grid's box in more than one of 10⁴ samples.
+    Args:
+        plant: The plant's model with its law and parameters.
+        settings: The solver's settings; the default ones where they are None.
+        workers: Threads that share the states; results do not depend on their number.
+        progress: Called after each round.
+
+    Raises:
+        OptimumError: The bounds do not close to 1 % of the gain, or the closed loop leaves the
+            grid's box in more than one of 10⁴ samples.
     """
-    problem, settings = plant.problem, settings or Settings()
+    problem = plant.problem
+    settings = settings or Settings()
     accuracy = settings.accuracy(plant)
-    draft, operator = (
-        BellmanOperator(plant, how, workers=workers) for how in (accuracy.draft(), accuracy)
-    )
+    draft = BellmanOperator(plant, accuracy.draft(), workers=workers)
+    operator = BellmanOperator(plant, accuracy, workers=workers)
     grid = first_grid(problem, draft, settings)
-    iterate = begin(draft, grid, np.tile(problem.reference_action, (grid.size, 1)))
+    iterate = start_policy(draft, grid, np.tile(problem.reference_action, (grid.size, 1)))
     run = partial(_iterate, settings=settings, progress=progress)
     approach = partial(run, draft, scan_points=5, start_only=True)
-    level = 0
     # Linear interpolation is monotone, so it converges from any start; it smears the closed loop
     # over its cells, so the support is known only once these are fine.
-    grids = [(1, False), *((k + 1, True) for k in range(settings.level))]
-    for finer, smooth in grids if settings.level else ():
+    grids = []
+    if settings.level:
+        grids = [(1, False)]
+        for finer in range(1, settings.level + 1):
+            grids.append((finer, True))
+    level = 0
+    for finer, smooth in grids:
         iterate = refined(draft, approach(iterate, level), settings, finer, smooth=smooth)
         level = finer
     # One round that looks for better actions in the whole action box.
@@ -839,47 +1037,71 @@ def _iterate(
     """Improve and evaluate until the bounds meet or, where `start_only`, the gain rests."""
     anchor = iterate.grid.nearest(operator.problem.reference_state)
     for k in range(rounds or settings.rounds):
-        before, better = iterate.gain, improve_policy(operator, iterate, scan_points)
+        last_gain = iterate.gain
+        better = improve_policy(operator, iterate, scan_points)
         W, gain, distribution = evaluate_policy(operator, better.grid, better.actions, anchor)
         iterate = replace(
-            better, W=W, gain=gain, distribution=distribution, accuracy=operator.accuracy
+            better,
+            W=W,
+            gain=gain,
+            distribution=distribution,
+            accuracy=operator.accuracy,
         )
         if progress is not None:
             progress(level, k, iterate)
-        left = before - gain if start_only else iterate.upper - iterate.lower
-        if left <= (1e-4 if start_only else settings.tolerance) * abs(gain):
+        if start_only:
+            done = last_gain - gain <= 1e-4 * abs(gain)
+        else:
+            done = iterate.upper - iterate.lower <= settings.tolerance * abs(gain)
+        if done:
             break
     return iterate
 
 
-def _accepted(found: Optimum) -> Optimum:
-    gain, lower, upper = found.gain, found.lower, found.upper
-    if upper - lower > 0.01 * abs(gain):
+def _accepted(optimum: Optimum) -> Optimum:
+    """The optimum with bounds about its gain; raises OptimumError where it is none (`solve`)."""
+    gain = optimum.gain
+    if optimum.upper - optimum.lower > 0.01 * abs(gain):
         raise OptimumError(
-            f"policy iteration: the bounds of the gain, {lower:.6g} and {upper:.6g}, are more than "
-            "1 % apart; allow more rounds or another grid"
+            f"policy iteration: the bounds of the gain, {optimum.lower:.6g} and "
+            f"{optimum.upper:.6g}, are more than 1 % apart; allow more rounds or another grid"
         )
-    mass, lower, upper = np.maximum(found.distribution, 0.0), min(lower, gain), max(upper, gain)
-    found = replace(found, distribution=mass, lower=lower, upper=upper)
-    if found.edge_mass > 1e-4:
+    accepted = replace(
+        optimum,
+        distribution=np.maximum(optimum.distribution, 0.0),
+        lower=min(optimum.lower, gain),
+        upper=max(optimum.upper, gain),
+    )
+    if accepted.edge_mass > 1e-4:
         raise OptimumError(
             f"the optimal closed loop is on the edge of the grid's box in "
-            f"{100 * found.edge_mass:.3g} % of the samples; widen the state bounds"
+            f"{100 * accepted.edge_mass:.3g} % of the samples; widen the state bounds"
         )
-    return found
+    return accepted
 
 
 def simulate_policy(
     plant: PlantProblem, optimum: Optimum, *, paths: int = 2000, steps: int = 5000
 ) -> tuple[float, float]:
-    """Mean cost per sample of a solution's policy on the plant's model, and half its 95 % interval.
+    """Mean cost per sample of a solution's policy on the plant's model.
 
     The policy is interpolated as in `OptimalPolicy`. Each of the independent paths starts in a
     state drawn from the stationary distribution; its first 300 samples are left out.
+
+    Args:
+        plant: The plant's model with its law and parameters.
+        optimum: The solution.
+        paths: Number of paths.
+        steps: Samples of each that count.
+
+    Returns:
+        The mean, and half of its 95 % interval.
     """
-    generator, burn_in = np.random.default_rng(0), 300
+    generator = np.random.default_rng(0)
+    burn_in = 300
     problem = plant.problem
-    step = Elementwise(discretise(problem.model, problem.sampling_time, optimum.accuracy.substeps))
+    sampled = discretise(problem.model, problem.sampling_time, optimum.accuracy.substeps)
+    step = Elementwise(sampled)
     cost = Elementwise(economic_cost(problem.model))
     table = Grid(optimum.grid.axes)
     policy = [table.interpolant(column) for column in optimum.actions.T]
@@ -909,16 +1131,29 @@ def certify(
 ) -> Optimum:
     """The solution on the grid of the next level, started from a solution, with a certificate.
 
-    Its figures: `solution`, the gain and its bounds on the given grid; `refinement`, those on the
+    Its estimates: `solution`, the gain and its bounds on the given grid; `refinement`, those on the
     next level; `simulation`, the mean cost of the refined policy on the plant's model, 95 %; where
-    it is added, `policy search`, the best θ that a search found, on the same noise. Raises
-    OptimumError as `solve` does.
+    it is added, `policy search`, the best θ that a search found, on the same noise.
+
+    Args:
+        plant: The plant's model with its law and parameters.
+        settings: The settings with which the solution was made.
+        optimum: The solution.
+        paths: Paths of the simulation.
+        steps: Samples of each path.
+        progress: Called after each round.
+
+    Raises:
+        OptimumError: As `solve` raises it.
     """
-    operator, level = BellmanOperator(plant, optimum.accuracy, workers=2), settings.level + 1
+    operator = BellmanOperator(plant, optimum.accuracy, workers=2)
+    level = settings.level + 1
     start = refined(operator, optimum, settings, level)
-    found = _accepted(_iterate(operator, start, level, settings, progress))
-    mean, half_width = simulate_policy(plant, found, paths=paths, steps=steps)
-    solved = {"solution": optimum, "refinement": found}
-    figures = [Figure(name, one.gain, one.lower, one.upper) for name, one in solved.items()]
-    figures.append(Figure("simulation", mean, mean - half_width, mean + half_width))
-    return replace(found, certificate=tuple(figures))
+    refinement = _accepted(_iterate(operator, start, level, settings, progress))
+    mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
+    certificate = (
+        Estimate("solution", optimum.gain, optimum.lower, optimum.upper),
+        Estimate("refinement", refinement.gain, refinement.lower, refinement.upper),
+        Estimate("simulation", mean, mean - half_width, mean + half_width),
+    )
+    return replace(refinement, certificate=certificate)

@@ -47,7 +47,7 @@ class SteadyState:
 
     def __str__(self) -> str:
         return (
-            f"optimal steady state: x = {_short(self.x)}, u = {_short(self.u)}, "
+            f"optimal steady state: x = {_five_digits(self.x)}, u = {_five_digits(self.u)}, "
             f"cost {self.cost:.6g}, active: {', '.join(self.active) or 'no bound'}"
         )
 
@@ -60,8 +60,10 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     """
     model = problem.model
     n = problem.n_states
-    x, u = ca.SX.sym("x", n), ca.SX.sym("u", problem.n_actions)
-    d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
+    x = ca.SX.sym("x", n)
+    u = ca.SX.sym("u", problem.n_actions)
+    d = ca.DM(model.nominal_disturbance)
+    p = ca.DM(model.nominal_parameters)
     x_next = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
     cost = model.economic_cost(x, u, ca.SX(d), ca.SX(p))
     w = ca.vertcat(x, u)
@@ -71,59 +73,77 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         "error_on_fail": False,
     }
     solver = ca.nlpsol("steady_state", "ipopt", {"x": w, "f": cost, "g": x_next - x}, options)
-    lower, upper = problem.lower, problem.upper
-    found = solver(x0=problem.reference, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+    solution = solver(x0=problem.reference, lbx=problem.lower, ubx=problem.upper, lbg=0.0, ubg=0.0)
     stats = solver.stats()
     if not stats["success"]:
         raise TuningError(
             f"the optimal steady state of model '{model.name}' was not found (IPOPT: "
             f"{stats['return_status']}); check bounds, and the reference, which is its start"
         )
-    point, costate = found["x"].full().reshape(-1), found["lam_g"].full().reshape(-1)
+
+    # What is left of the gradient of cost and dynamics are the bounds' multipliers.
+    point = solution["x"].full().reshape(-1)
+    costate = solution["lam_g"].full().reshape(-1)
     lagrangian = cost + ca.dot(ca.SX(ca.DM(costate)), x_next - x)
     hessian, gradient = ca.hessian(lagrangian, w)
     derivatives = ca.Function("d", [w], [hessian, gradient, ca.jacobian(x_next, w)])
     hessian, gradient, jacobian = (value.full() for value in derivatives(point))
     multipliers = gradient.reshape(-1)
-    strict = np.flatnonzero(np.abs(multipliers) > _STRICT * max(1.0, np.abs(multipliers).max()))
-    active, quantities = [], (*model.states, *model.actions)
-    for i in strict:
-        quantity = quantities[i]
-        if i < n and abs(multipliers[i]) >= problem.penalty_linear[i]:
-            raise TuningError(
-                f"the penalty of {quantity.name} is too small: its linear weight "
-                f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
-                f"{abs(multipliers[i]):g}"
-            )
-        relation, bound = ("≥", lower[i]) if multipliers[i] > 0 else ("≤", upper[i])
-        active.append(f"{quantity.name} {relation} {bound:g} {quantity.unit}".rstrip())
+    least = _STRICT * max(1.0, np.abs(multipliers).max())
+    strict = np.flatnonzero(np.abs(multipliers) > least)
     return SteadyState(
         x=point[:n],
         u=point[n:],
-        cost=float(found["f"]),
+        cost=float(solution["f"]),
         costate=costate,
         multipliers=multipliers,
         A=jacobian[:, :n],
         B=jacobian[:, n:],
         hessian=hessian,
         C=np.eye(len(point))[strict],
-        active=tuple(active),
+        active=tuple(_active_bound(problem, i, multipliers[i]) for i in strict.tolist()),
     )
 
 
+def _active_bound(problem: Problem, i: int, multiplier: float) -> str:
+    """The active bound of entry i of (x, u) in words; TuningError where it would be violated."""
+    model = problem.model
+    quantity = (*model.states, *model.actions)[i]
+    if i < problem.n_states and abs(multiplier) >= problem.penalty_linear[i]:
+        raise TuningError(
+            f"the penalty of {quantity.name} is too small: its linear weight "
+            f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
+            f"{abs(multiplier):g}"
+        )
+    if multiplier > 0:
+        return f"{quantity.name} ≥ {problem.lower[i]:g} {quantity.unit}".rstrip()
+    return f"{quantity.name} ≤ {problem.upper[i]:g} {quantity.unit}".rstrip()
+
+
 def local_feedback(A: Array, B: Array, H: Array, C: Array) -> tuple[Array, Array]:
-    """Gain K (m, n) of u = Kx and value P (n, n) of min Σ ½ wᵀHw, w = (x, u), x₊ = Ax + Bu, γ = 1.
+    """Gain K of u = Kx and value P of min Σ ½ wᵀHw, w = (x, u), x₊ = Ax + Bu, γ = 1.
 
     It solves the Riccati equation on the manifold C w_k = 0, k ≥ 1, of the active constraints. A
-    row of `C` (n_c, n+m) with an entry in u binds from k = 0 on, one of the state alone binds the
-    next state. H (n+m, n+m) may be indefinite. Raises TuningError where the actions cannot keep the
-    constraints, or no stabilising solution exists.
+    row of `C` with an entry in u binds from k = 0 on, one of the state alone binds the next state.
+
+    Args:
+        A: Jacobian of the next state by the state, (n, n).
+        B: Jacobian by the action, (n, m).
+        H: Hessian of the stage cost, (n+m, n+m); it may be indefinite.
+        C: Gradients of the active constraints, (n_c, n+m).
+
+    Returns:
+        K (m, n) and P (n, n).
+
+    Raises:
+        TuningError: The actions cannot keep the constraints, or no stabilising solution exists.
     """
     n, m = B.shape
     on_action = np.abs(C[:, n:]).max(axis=1, initial=0.0) > 0
     rows = np.vstack([C[on_action], C[~on_action, :n] @ np.hstack([A, B])])
-    # Actions that keep the constraints: u = particular x + free v.
-    gain, free = np.zeros((m, n)), np.eye(m)
+    # Actions that keep the constraints: u = gain x + free v.
+    gain = np.zeros((m, n))
+    free = np.eye(m)
     if len(rows):
         if np.linalg.matrix_rank(rows[:, n:]) < len(rows):
             raise TuningError(
@@ -133,26 +153,39 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> tuple[Array, Array
         gain = -np.linalg.pinv(rows[:, n:]) @ rows[:, :n]
         free = null_space(rows[:, n:])
     if free.shape[1]:
-        # The Riccati equation of v.
-        change = np.block([[np.eye(n), np.zeros((n, free.shape[1]))], [gain, free]])
-        reduced, a, b = change.T @ H @ change, A + B @ gain, B @ free
-        q, r, s = reduced[:n, :n], reduced[n:, n:], reduced[:n, n:]
-        try:
-            P = solve_discrete_are(a, b, q, r, s=s)
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise TuningError(
-                f"the steady state has no stabilising local feedback of finite cost ({error})"
-            ) from error
-        curvature = r + b.T @ P @ b
-        if np.linalg.eigvalsh(_symmetric(curvature)).min() <= 0:
-            raise TuningError("the steady state is no local minimum of the economic cost")
-        gain = gain + free @ -np.linalg.solve(curvature, b.T @ P @ a + s.T)
-    closed, stage = A + B @ gain, np.vstack([np.eye(n), gain])
+        gain = gain + free @ _unconstrained_feedback(A, B, H, gain, free)
+
+    closed = A + B @ gain
+    stage = np.vstack([np.eye(n), gain])
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
         raise TuningError("the active constraints, once kept, make the closed loop unstable")
     # P = stage + closedᵀ P closed: the Riccati solver's P is accurate in the gain's part only.
     P = solve_discrete_lyapunov(closed.T, stage.T @ H @ stage, method="direct")
     return gain, _symmetric(P)
+
+
+def _unconstrained_feedback(A: Array, B: Array, H: Array, gain: Array, free: Array) -> Array:
+    """Gain of v = Kx, where u = `gain` x + `free` v, by the Riccati equation of v."""
+    n = len(A)
+    count = free.shape[1]
+    change = np.block([[np.eye(n), np.zeros((n, count))], [gain, free]])
+    reduced = change.T @ H @ change
+    a = A + B @ gain
+    b = B @ free
+    q = reduced[:n, :n]
+    r = reduced[n:, n:]
+    s = reduced[:n, n:]
+    try:
+        P = solve_discrete_are(a, b, q, r, s=s)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise TuningError(
+            f"the steady state has no stabilising local feedback of finite cost ({error})"
+        ) from error
+    curvature = r + b.T @ P @ b
+    if np.linalg.eigvalsh(_symmetric(curvature)).min() <= 0:
+        raise TuningError("the steady state is no local minimum of the economic cost")
+    solution: Array = -np.linalg.solve(curvature, b.T @ P @ a + s.T)
+    return solution
 
 
 @dataclass(frozen=True)
@@ -171,7 +204,13 @@ class Convexification:
 
 
 def rotation(A: Array, B: Array, delta_P: Array) -> Array:
-    """𝓗(δP) = [A B]ᵀ δP [A B] − [I 0]ᵀ δP [I 0]: the storage ½xᵀδPx as a stage cost."""
+    """𝓗(δP) = [A B]ᵀ δP [A B] − [I 0]ᵀ δP [I 0]: the storage ½xᵀδPx as a stage cost.
+
+    Args:
+        A: Jacobian of the next state by the state, (n, n).
+        B: Jacobian by the action, (n, m).
+        delta_P: Matrix of the storage, (n, n).
+    """
     dynamics = np.hstack([A, B])
     rotated: Array = dynamics.T @ delta_P @ dynamics
     rotated[: len(A), : len(A)] -= delta_P
@@ -181,53 +220,72 @@ def rotation(A: Array, B: Array, delta_P: Array) -> Array:
 def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> Convexification:
     """Best-conditioned convex stage cost with the same local optimum.
 
-    min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F, with ρ = `weight`
+    min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F
     (Zanon, Gros, Diehl 2016). 𝓗(δP) telescopes along a trajectory and CᵀFC vanishes where C w = 0,
-    so neither changes the optimal feedback. Raises TuningError where there is no solution: the
-    steady state is not locally optimal under these constraints.
+    so neither changes the optimal feedback.
+
+    Args:
+        A: Jacobian of the next state by the state, (n, n).
+        B: Jacobian by the action, (n, m).
+        H: Hessian of the stage cost, (n+m, n+m).
+        C: Gradients of the active constraints, (n_c, n+m).
+        weight: ρ.
+
+    Raises:
+        TuningError: There is no solution: the steady state is not locally optimal under these
+            constraints.
     """
-    size, n, n_c = len(H), len(A), len(C)
-    rotations = [rotation(A, B, e) for e in _symmetric_basis(n)]
-    forces = [C.T @ e @ C for e in _symmetric_basis(n_c)]
+    size = len(H)
+    n = len(A)
+    n_c = len(C)
+    rotations = [rotation(A, B, unit) for unit in _symmetric_basis(n)]
+    forces = [C.T @ unit @ C for unit in _symmetric_basis(n_c)]
+    # The convexified Hessian is linear in α, δP and F: a column each.
     columns = np.stack([svec(matrix) for matrix in (H, *rotations, *forces)], axis=1)
-    count, triangle = columns.shape[1], columns.shape[0]
+    triangle, count = columns.shape
     identity = svec(np.eye(size))[:, None]
+    zeros = np.zeros((triangle, 1))
+
     # Variables: α, δP, F, β, t with t ≥ ‖F‖.
     n_F = n_c * (n_c + 1) // 2
-    zeros = np.zeros((triangle, 1))
-    nonnegative, norm = np.zeros((1, count + 2)), np.zeros((1 + n_F, count + 2))
-    nonnegative[0, 0] = norm[0, -1] = -1.0
+    nonnegative = np.zeros((1, count + 2))
+    nonnegative[0, 0] = -1.0
+    norm = np.zeros((1 + n_F, count + 2))
+    norm[0, -1] = -1.0
     norm[1:, count - n_F : count] = -np.diag([np.linalg.norm(e) for e in _symmetric_basis(n_c)])
-    above, below = np.hstack([-columns, zeros, zeros]), np.hstack([columns, -identity, zeros])
-    constraints = np.vstack([nonnegative, norm, above, below])
+    above_identity = np.hstack([-columns, zeros, zeros])
+    below_beta = np.hstack([columns, -identity, zeros])
+    constraints = np.vstack([nonnegative, norm, above_identity, below_beta])
     offset = np.concatenate([np.zeros(2 + n_F), -identity[:, 0], np.zeros(triangle)])
     cones = [
         clarabel.NonnegativeConeT(1),
         clarabel.SecondOrderConeT(1 + n_F),
-        *2 * [clarabel.PSDTriangleConeT(size)],
+        clarabel.PSDTriangleConeT(size),
+        clarabel.PSDTriangleConeT(size),
     ]
     objective = np.zeros(count + 2)
-    objective[-2:] = 1.0, weight
-    z, status = solve_conic(
-        np.zeros((count + 2, count + 2)), objective, constraints, offset, cones, iterations=500
-    )
+    objective[-2] = 1.0
+    objective[-1] = weight
+    quadratic = np.zeros((count + 2, count + 2))
+    z, status = solve_conic(quadratic, objective, constraints, offset, cones, iterations=500)
     if z is None or not z[0] > 0:
+        constraint = "constraint" if n_c == 1 else "constraints"
         raise TuningError(
             f"no convex cost has the local optimum of the economic one with {n_c} active "
-            f"constraint{'' if n_c == 1 else 's'} (Clarabel: {status}): staying at the "
-            "steady state is not optimal"
+            f"{constraint} (Clarabel: {status}): staying at the steady state is not optimal"
         )
+
     alpha = float(z[0])
     delta_P = symmetric_matrix(z[1 : count - n_F], n) / alpha
     F = symmetric_matrix(z[count - n_F : count], n_c) / alpha
-    hessian = H + rotation(A, B, delta_P) + C.T @ F @ C
-    found = Convexification(_symmetric(hessian), delta_P, F, alpha, float(z[-2]))
-    if not (least := np.linalg.eigvalsh(found.hessian)[0]) > 0:
+    hessian = _symmetric(H + rotation(A, B, delta_P) + C.T @ F @ C)
+    least = np.linalg.eigvalsh(hessian)[0]
+    if not least > 0:
         raise TuningError(
             f"the convexified cost is not positive definite (smallest eigenvalue {least:.3g}, "
             f"Clarabel: {status})"
         )
-    return found
+    return Convexification(hessian, delta_P, F, alpha, float(z[-2]))
 
 
 def _symmetric_basis(size: int) -> list[Array]:
@@ -255,20 +313,22 @@ class EconomicTuning:
         return float(np.abs(self.tuned - self.economic).max())
 
     def __str__(self) -> str:
-        steady, convex = self.steady_state, self.convexification
-        active = ", ".join(
-            f"{name} (multiplier {multiplier:.4g})"
-            for name, multiplier in zip(steady.active, steady.C @ steady.multipliers, strict=True)
-        )
+        steady = self.steady_state
+        convex = self.convexification
+        active = []
+        for name, multiplier in zip(steady.active, steady.C @ steady.multipliers, strict=True):
+            active.append(f"{name} (multiplier {multiplier:.4g})")
+        economic = _five_digits(np.linalg.eigvalsh(steady.hessian))
+        convexified = _five_digits(np.linalg.eigvalsh(convex.hessian))
         return "\n".join(
             [
-                f"optimal steady state  x = {_short(steady.x)}, u = {_short(steady.u)}, "
-                f"cost {steady.cost:.6g}",
-                f"strictly active       {active or 'none'}",
-                f"economic Hessian      eigenvalues {_short(np.linalg.eigvalsh(steady.hessian))}",
-                f"convexified Hessian   eigenvalues {_short(np.linalg.eigvalsh(convex.hessian))}, "
-                f"α = {convex.alpha:.4g}, β = {convex.beta:.4g}, F = {_short(convex.F)}",
-                f"economic gain         {_short(self.economic)}",
+                f"optimal steady state  x = {_five_digits(steady.x)}, "
+                f"u = {_five_digits(steady.u)}, cost {steady.cost:.6g}",
+                f"strictly active       {', '.join(active) or 'none'}",
+                f"economic Hessian      eigenvalues {economic}",
+                f"convexified Hessian   eigenvalues {convexified}, "
+                f"α = {convex.alpha:.4g}, β = {convex.beta:.4g}, F = {_five_digits(convex.F)}",
+                f"economic gain         {_five_digits(self.economic)}",
                 f"tuned gain            differs by {self.gain_error:.2g}",
             ]
         )
@@ -280,13 +340,20 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B] and V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx: H̃ is the
     convexified Hessian, q the gradient along the active constraints, P the value of H̃ under γ = 1.
     λ_θ undoes the rotations by costate and storage, so that V_θ is to second order the economic
-    value; c_λ is ℓ_s. θ is rounded to six digits. Raises TuningError where steady state, local
-    optimum or convexification do not exist.
+    value; c_λ is ℓ_s. θ is rounded to six digits.
+
+    Args:
+        problem: The control problem.
+        blocks: The blocks of θ; the paper's where they are None.
+
+    Raises:
+        TuningError: Steady state, local optimum or convexification do not exist.
     """
-    steady = optimal_steady_state(
-        dataclasses.replace(problem, substeps=linearisation_substeps(problem))
-    )
-    n, A, B = problem.n_states, steady.A, steady.B
+    substeps = linearisation_substeps(problem)
+    steady = optimal_steady_state(dataclasses.replace(problem, substeps=substeps))
+    n = problem.n_states
+    A = steady.A
+    B = steady.B
     try:
         economic, _ = local_feedback(A, B, steady.hessian, steady.C)
         convex = convexify(A, B, steady.hessian, steady.C, 1e-3)
@@ -298,7 +365,8 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
         ) from error
     dynamics = np.hstack([A, B])
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
-    q, C_x = steady.multipliers, steady.C[:, :n]
+    q = steady.multipliers
+    C_x = steady.C[:, :n]
     # θ's quadratics are about the reference, the tuning's about the optimal steady state.
     shift = problem.reference - np.concatenate([steady.x, steady.u])
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
@@ -310,9 +378,8 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
         "B_lambda": _symmetric(0.5 * initial),
         "b_lambda": steady.costate + initial @ shift[:n],
     }
-    parameters = Parameters.naive(problem, blocks).replace(
-        {name: _rounded(value) for name, value in values.items()}
-    )
+    rounded = {name: _rounded(value) for name, value in values.items()}
+    parameters = Parameters.naive(problem, blocks).replace(rounded)
     return EconomicTuning(parameters, steady, convex, economic, tuned)
 
 
@@ -322,26 +389,35 @@ def linearisation_substeps(problem: Problem) -> int:
     The error is that of A and B. The problem's own number is doubled until doubling it once more
     changes less. Raises TuningError where 1024 steps are too few.
     """
-    model, (x, u, d, p), h = problem.model, problem.model.symbols(), ca.SX.sym("h")
-    after = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, 1)
+    model = problem.model
+    n = problem.n_states
+    m = problem.n_actions
+    x, u, d, p = model.symbols()
+    h = ca.SX.sym("h")
+    after = runge_kutta(lambda state: model.ode(state, u, d, p), x, h, 1)
     step = ca.Function("step", [x, u, d, p, h], [after, ca.jacobian(after, ca.vertcat(x, u))])
-    given = problem.reference_action, model.nominal_disturbance, model.nominal_parameters
-    length, n, m = problem.sampling_time / model.time_unit, problem.n_states, problem.n_actions
+    nominal = model.nominal_disturbance, model.nominal_parameters
+    length = problem.sampling_time / model.time_unit
 
     def linear(substeps: int) -> Array:
         """A and B side by side."""
-        at, moved = problem.reference_state, np.eye(n, n + m)
+        state = problem.reference_state
+        jacobian = np.eye(n, n + m)
+        actions = np.eye(m, n + m, n)
         for _ in range(substeps):
-            at, slope = (part.full() for part in step(at, *given, length / substeps))
-            moved = slope @ np.vstack([moved, np.eye(m, n + m, n)])
-        return moved
+            results = step(state, problem.reference_action, *nominal, length / substeps)
+            state, slope = (part.full() for part in results)
+            jacobian = slope @ np.vstack([jacobian, actions])
+        return jacobian
 
-    substeps, present = problem.substeps, linear(problem.substeps)
+    substeps = problem.substeps
+    present = linear(substeps)
     while substeps <= 1024:
         finer = linear(2 * substeps)
         if (np.abs(finer - present) <= 1e-8 * (1.0 + np.abs(present))).all():
             return substeps
-        substeps, present = 2 * substeps, finer
+        substeps = 2 * substeps
+        present = finer
     raise TuningError(
         f"model '{problem.model.name}' cannot be integrated to 1e-08 over a sample of "
         f"{problem.sampling_time:g} s"
@@ -350,12 +426,18 @@ def linearisation_substeps(problem: Problem) -> int:
 
 def linear_model(problem: Problem) -> tuple[Array, Array]:
     """A (n, n) and B (n, m) of the sampled nominal model at the problem's reference."""
-    model, (x, u, d, p) = problem.model, problem.model.symbols()
+    n = problem.n_states
+    model = problem.model
+    x, u, d, p = model.symbols()
     following = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
     jacobian = ca.Function("AB", [x, u, d, p], [ca.jacobian(following, ca.vertcat(x, u))])
-    at = (problem.reference_state, problem.reference_action)
-    both = jacobian(*at, model.nominal_disturbance, model.nominal_parameters).full()
-    return both[:, : problem.n_states], both[:, problem.n_states :]
+    both = jacobian(
+        problem.reference_state,
+        problem.reference_action,
+        model.nominal_disturbance,
+        model.nominal_parameters,
+    ).full()
+    return both[:, :n], both[:, n:]
 
 
 def _rounded(block: Array) -> Array:
@@ -369,9 +451,11 @@ def _symmetric(matrix: NDArray[np.floating[Any]]) -> Array:
     return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)
 
 
-def _short(array: NDArray[np.floating[Any]]) -> str:
+def _five_digits(array: NDArray[np.floating[Any]]) -> str:
     """Entries to five digits, on one line."""
-    rows = [_short(row) if row.ndim else f"{float(row):.5g}" for row in array]
+    rows = []
+    for row in array:
+        rows.append(_five_digits(row) if row.ndim else f"{float(row):.5g}")
     return f"[{', '.join(rows)}]"
 
 
@@ -380,18 +464,34 @@ def solve_conic(
 ) -> tuple[Array | None, str]:
     """Solve min ½xᵀPx + qᵀx s.t. b − Ax in the product of Clarabel's `cones`.
 
-    P (d, d), of which the upper triangle is read, q (d,), A (c, d), b (c,). `PSDTriangleConeT`, of
-    positive semidefinite matrices, takes the rows that `svec` gives. Returns the minimiser, None
-    where there is none, and the solver's word for how it ended.
+    Args:
+        P: Hessian (d, d), of which the upper triangle is read.
+        q: Gradient, (d,).
+        A: Matrix of the constraints, (c, d).
+        b: Their right-hand side, (c,).
+        cones: Clarabel's cones of b − Ax, in the order of its rows. `PSDTriangleConeT`, of positive
+            semidefinite matrices, takes the rows that `svec` gives.
+        iterations: Most iterations.
+
+    Returns:
+        The minimiser (d,), None where there is none, and the solver's word for how it ended.
     """
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_iter = iterations
-    solution = clarabel.DefaultSolver(
-        sparse.csc_matrix(np.triu(P)), q, sparse.csc_matrix(A), b, list(cones), settings
-    ).solve()
+    solver = clarabel.DefaultSolver(
+        sparse.csc_matrix(np.triu(P)),
+        q,
+        sparse.csc_matrix(A),
+        b,
+        list(cones),
+        settings,
+    )
+    solution = solver.solve()
     status = str(solution.status)
-    return np.array(solution.x) if status in {"Solved", "AlmostSolved"} else None, status
+    if status not in {"Solved", "AlmostSolved"}:
+        return None, status
+    return np.array(solution.x), status
 
 
 def svec(matrix: Array) -> Array:

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from controllers.errors import ModelError, ModelWarning, warn
 from controllers.problem import Problem
+from controllers.qp import Mask
 from cosim.core.protocols import Matrix
-
-Mask = NDArray[np.bool_]
 
 TOLERANCE = 0.01
 """Share of a state's range by which a sample's prediction may be off without a word."""

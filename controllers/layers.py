@@ -11,6 +11,17 @@ from controllers.rti.nmpc import RtiNmpc
 
 Layer = Callable[..., tuple[Any, Any]]
 
+# The arrays of a `BatchSolution` in its order, as both packages get them: first what the layer
+# returns, then the derivatives that its backward pass contracts.
+OUTPUTS = ("action", "value")
+DERIVATIVES = (
+    "state_gradient",
+    "value_gradient",
+    "action_gradient",
+    "policy_jacobian",
+    "policy_state_jacobian",
+)
+
 
 def torch_layer(controller: RtiNmpc) -> Layer:
     """`layer(states, theta, enforced=None, points=None)`: actions and values as PyTorch tensors.
@@ -23,21 +34,37 @@ def torch_layer(controller: RtiNmpc) -> Layer:
     """
     torch = _module("torch")
 
+    def to_numpy(argument: Any) -> Any:
+        return argument.detach().cpu() if torch.is_tensor(argument) else argument
+
     class RtiNmpcFunction(torch.autograd.Function):  # type: ignore[misc,name-defined]
         @staticmethod
-        def forward(ctx: Any, *given: Any) -> Any:
-            tensors = (each.detach().cpu() if torch.is_tensor(each) else each for each in given)
-            wanted: dict[str, Any] = {"derivatives": any(ctx.needs_input_grad)}
-            found = controller.feedback_batch(*tensors, **wanted)
-            actions, values, *slopes = (torch.from_numpy(part).to(given[0]) for part in found)
-            ctx.save_for_backward(*slopes)
-            ctx.given = given
-            return actions, values
+        def forward(ctx: Any, states: Any, theta: Any, enforced: Any, points: Any) -> Any:
+            needed = any(ctx.needs_input_grad)
+            solution = controller.feedback_batch(
+                to_numpy(states),
+                to_numpy(theta),
+                to_numpy(enforced),
+                points,
+                derivatives=needed,
+            )
+
+            def tensor(name: str) -> Any:
+                return torch.from_numpy(getattr(solution, name)).to(states)
+
+            if needed:
+                ctx.save_for_backward(*map(tensor, DERIVATIVES))
+            ctx.theta = theta
+            ctx.enforced = enforced
+            return tensor("action"), tensor("value")
 
         @staticmethod
         @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
-        def backward(ctx: Any, *by: Any) -> Any:
-            return *_pull_back(torch.einsum, ctx.saved_tensors, by, ctx.given), None
+        def backward(ctx: Any, by_action: Any, by_value: Any) -> Any:
+            gradients = _pull_back(
+                torch.einsum, ctx.saved_tensors, by_action, by_value, ctx.theta, ctx.enforced
+            )
+            return *gradients, None
 
     def layer(states: Any, theta: Any, enforced: Any = None, points: Any = None) -> Any:
         return RtiNmpcFunction.apply(states, theta, enforced, points)
@@ -51,26 +78,43 @@ def jax_layer(controller: RtiNmpc) -> Layer:
     Raises ControllerError without JAX, the extra `jax`.
     """
     jax = _module("jax")
-    n, m, size = controller.problem.n_states, controller.problem.n_actions, controller.theta.size
-    shapes = (m,), (), (n,), (size,), (m,), (m, size), (m, n)
+    n = controller.problem.n_states
+    m = controller.problem.n_actions
+    size = controller.theta.size
+    shapes = {
+        "action": (m,),
+        "value": (),
+        "state_gradient": (n,),
+        "value_gradient": (size,),
+        "action_gradient": (m,),
+        "policy_jacobian": (m, size),
+        "policy_state_jacobian": (m, n),
+    }
 
     def solve(derivatives: bool, states: Any, *others: Any) -> Any:
-        def call(*given: Any) -> Any:
-            found = controller.feedback_batch(*given, derivatives=derivatives)
-            return tuple(part.astype(states.dtype) for part in found)
+        """Arrays of the solution by JAX's callback, which must say their shapes beforehand."""
+        names = OUTPUTS + DERIVATIVES if derivatives else OUTPUTS
 
-        results = [jax.ShapeDtypeStruct((len(states), *shape), states.dtype) for shape in shapes]
-        wanted = tuple(results if derivatives else results[:2])
-        return jax.pure_callback(call, wanted, states, *others, vmap_method="sequential")
+        def call(*arguments: Any) -> Any:
+            solution = controller.feedback_batch(*arguments, derivatives=derivatives)
+            return tuple(getattr(solution, name).astype(states.dtype) for name in names)
 
-    def forward(*given: Any) -> Any:
-        actions, values, *slopes = solve(True, *given)
-        return (actions, values), (slopes, given)
+        results = []
+        for name in names:
+            shape = (len(states), *shapes[name])
+            results.append(jax.ShapeDtypeStruct(shape, states.dtype))
+        return jax.pure_callback(call, tuple(results), states, *others, vmap_method="sequential")
 
-    def backward(kept: Any, by: Any) -> Any:
-        slopes, given = kept
-        points = jax.tree.map(jax.numpy.zeros_like, given[-1])
-        return *_pull_back(jax.numpy.einsum, slopes, by, given), points
+    def forward(*arguments: Any) -> Any:
+        action, value, *derivatives = solve(True, *arguments)
+        return (action, value), (derivatives, arguments)
+
+    def backward(saved: Any, by: Any) -> Any:
+        derivatives, (_, theta, enforced, points) = saved
+        by_action, by_value = by
+        gradients = _pull_back(jax.numpy.einsum, derivatives, by_action, by_value, theta, enforced)
+        # The points are held: their gradient is zero, in the shape in which they came.
+        return *gradients, jax.tree.map(jax.numpy.zeros_like, points)
 
     @jax.custom_vjp  # type: ignore[untyped-decorator]
     def layer(states: Any, theta: Any, enforced: Any = None, points: Any = None) -> Any:
@@ -87,14 +131,31 @@ def _module(name: str) -> Any:
         raise ControllerError(f"{name} is missing: pip install 'rti-cosim[{name}]'") from error
 
 
-def _pull_back(einsum: Any, slopes: Any, by: Any, given: Any) -> tuple[Any, Any, Any]:
-    """Gradients in states, θ and enforced actions of `by`, those in the actions and values."""
-    value_s, value_theta, value_a, policy_theta, policy_s = slopes
-    _, theta, enforced, _ = given
+def _pull_back(
+    einsum: Any, derivatives: Any, by_action: Any, by_value: Any, theta: Any, enforced: Any
+) -> tuple[Any, Any, Any]:
+    """Gradients in states, θ and enforced actions of those in the layer's outputs.
+
+    Args:
+        einsum: The package's.
+        derivatives: Arrays of `BatchSolution` by `DERIVATIVES`.
+        by_action: Gradient in the actions, (K, m).
+        by_value: Gradient in the values, (K,).
+        theta: θ as it was given: one for all rows gets the sum of its rows' gradients.
+        enforced: Actions as they were given, or None.
+
+    Returns:
+        Gradients of the shapes of states, θ and enforced actions; None for the last without these.
+    """
+    value_state, value_theta, value_action, policy_theta, policy_state = derivatives
 
     def pull(value: Any, policy: Any) -> Any:
-        return einsum("k,ki->ki", by[1], value) + einsum("km,kmi->ki", by[0], policy)
+        return einsum("k,ki->ki", by_value, value) + einsum("km,kmi->ki", by_action, policy)
 
     by_theta = pull(value_theta, policy_theta)
-    by_enforced = None if enforced is None else by[0] + einsum("k,ki->ki", by[1], value_a)
-    return pull(value_s, policy_s), by_theta.sum(0) if theta.ndim == 1 else by_theta, by_enforced
+    if theta.ndim == 1:
+        by_theta = by_theta.sum(0)
+    by_enforced = None
+    if enforced is not None:  # the action that the layer returns is the enforced one
+        by_enforced = by_action + einsum("k,ki->ki", by_value, value_action)
+    return pull(value_state, policy_state), by_theta, by_enforced

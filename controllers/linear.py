@@ -24,9 +24,11 @@ class Lqr:
     """
 
     def __init__(self, problem: Problem) -> None:
-        H = tune(problem).convexification.hessian
         self.problem = problem
-        gain, _ = local_feedback(*linear_model(problem), H, np.zeros((0, len(H))))
+        H = tune(problem).convexification.hessian
+        A, B = linear_model(problem)
+        no_constraints = np.zeros((0, len(H)))
+        gain, _ = local_feedback(A, B, H, no_constraints)
         self.gain = -gain
 
     def reset(self) -> None:
@@ -36,7 +38,12 @@ class Lqr:
         """Do nothing."""
 
     def feedback(self, s: Array, a: Array | None = None) -> Decision:
-        """Action (m,) at the state s (n,), `a` (m,) where it is given."""
+        """The law's action, or the one that is enforced.
+
+        Args:
+            s: State in the model's units, (n,).
+            a: Action to enforce, (m,).
+        """
         problem = self.problem
         u = problem.reference_action - self.gain @ (s - problem.reference_state)
         action: Array = np.clip(u, problem.action_lower, problem.action_upper)
@@ -55,27 +62,38 @@ class PiLoops:
 
     def __init__(self, problem: Problem) -> None:
         A, B = linear_model(problem)
-        self.problem, self.states = problem, pairing(B)
-        pole = np.clip(np.diag(A), 1e-9, 1.0 - 1e-9)[self.states]  # an integrator's τ is long
+        self.problem = problem
+        self.states = pairing(B)
+        # The clip gives an integrator a long time constant, and a state without memory a short one.
+        pole = np.clip(np.diag(A), 1e-9, 1.0 - 1e-9)[self.states]
         time_constant = -1.0 / np.log(pole)
-        self.gain = time_constant * (1.0 - pole) / B[self.states, np.arange(len(B))]
+        sample_gain = B[self.states, np.arange(len(B))]
+        self.gain = time_constant * (1.0 - pole) / sample_gain
         self.reset_time = np.minimum(time_constant, 4.0)
         self.reset()
 
     def reset(self) -> None:
         """Empty the integrals."""
-        self._integral = self._increment = np.zeros(self.states.size)
+        self._integral = np.zeros(self.states.size)
+        self._increment = np.zeros(self.states.size)
 
     def prepare(self) -> None:
         """Integrate the last sample's error."""
-        self._integral, self._increment = self._integral + self._increment, 0 * self._increment
+        self._integral = self._integral + self._increment
+        self._increment = np.zeros(self.states.size)
 
     def feedback(self, s: Array, a: Array | None = None) -> Decision:
-        """Action (m,) at the state s (n,), `a` (m,) where it is given."""
+        """The law's action, or the one that is enforced.
+
+        Args:
+            s: State in the model's units, (n,).
+            a: Action to enforce, (m,).
+        """
         problem = self.problem
         error = (problem.reference_state - s)[self.states]
         u = problem.reference_action + self.gain * (error + self._integral)
         action: Array = np.clip(u, problem.action_lower, problem.action_upper)
+        # At a bound the integral stops where it would push on (conditional integration).
         winds_up = (u - action) * self.gain * error > 0.0
         self._increment = np.where(winds_up, 0.0, error / self.reset_time)
         return Decision(action if a is None else a)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from controllers.dynamic_programming import (
     Accuracy,
     BellmanOperator,
-    Figure,
+    Estimate,
     Grid,
     Optimum,
     Progress,
@@ -33,15 +33,15 @@ from controllers.model import Model
 from controllers.problem import VECTORS, PlantProblem, load_model
 from cosim.core.files import cache_folder, read_arrays, write_atomically
 from cosim.core.protocols import Decision, Vector
-from cosim.core.scenario import Scenario, is_file
+from cosim.core.scenario import ChangeTable, Scenario, is_file
 
-VERSION = 2
+SOLVER_VERSION = 2
 """Part of every key; to be raised when the solver's results change."""
 SHIPPED = Path(__file__).parent / "optima"
-DAY = 86400.0
-NODES = 6
+SECONDS_A_DAY = 86400.0
+FOULING_NODES = 6
 """Values of the fouled parameter whose optima make the quasi-static reference."""
-FOULING = ("fouling_rate", "fouling_floor", "cleaning_period")
+FOULING_PARAMETERS = ("fouling_rate", "fouling_floor", "cleaning_period")
 """The plant's parameters of the law of fouling; the model has none of them."""
 
 
@@ -49,17 +49,23 @@ FOULING = ("fouling_rate", "fouling_floor", "cleaning_period")
 
 
 def optimum_key(plant: PlantProblem, settings: Settings) -> str:
-    """First 16 hexadecimal digits of the SHA-256 of all that the solution depends on."""
-    problem, law, parameters = plant.problem, plant.law, plant.parameters
+    """First 16 hexadecimal digits of the SHA-256 of all that the solution depends on.
+
+    Args:
+        plant: The plant's model with its law and parameters.
+        settings: The solver's settings.
+    """
+    problem = plant.problem
+    law = plant.law
     symbols = problem.model.symbols()
     content: dict[str, Any] = {
-        "version": VERSION,
+        "version": SOLVER_VERSION,
         "ode": _operations(problem.model.ode(*symbols), symbols),
         "cost": _operations(problem.model.economic_cost(*symbols), symbols),
         "time_unit": problem.model.time_unit,
         "sampling_time": problem.sampling_time,
         "discount": 1.0,
-        "parameters": parameters.tolist(),
+        "parameters": plant.parameters.tolist(),
         "law": [law.kind, law.nominal.tolist(), law.ranges.tolist()],
         "settings": asdict(settings) | {"criterion": "average"},
     }
@@ -88,12 +94,27 @@ def stored_file(key: str) -> Path | None:
 
 
 def keep(key: str, optimum: Optimum) -> Path:
-    """Keep a solved problem in the user's cache; returns its file."""
+    """Keep a solved problem in the user's cache.
+
+    Args:
+        key: The problem's `optimum_key`.
+        optimum: Its solution.
+
+    Returns:
+        The file.
+    """
     return write_optimum(cache_folder("optima") / f"{key}.npz", optimum, key)
 
 
 def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
-    """Write a solved problem as a compressed .npz; equal content gives equal bytes."""
+    """Write a solved problem as a compressed .npz; equal content gives equal bytes.
+
+    Args:
+        path: The file.
+        optimum: The solution.
+        key: The problem's `optimum_key`, which the file holds too.
+    """
+    certificate = [estimate._asdict() for estimate in optimum.certificate]
     document = {
         "key": key,
         "gain": optimum.gain,
@@ -101,10 +122,12 @@ def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
         "upper": optimum.upper,
         "accuracy": asdict(optimum.accuracy),
         "smooth": optimum.grid.smooth,
-        "certificate": [figure._asdict() for figure in optimum.certificate] or None,
+        "certificate": certificate or None,
     }
     arrays: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(optimum.grid.axes)}
-    arrays |= {name: getattr(optimum, name) for name in ("actions", "W", "distribution")}
+    arrays["actions"] = optimum.actions
+    arrays["W"] = optimum.W
+    arrays["distribution"] = optimum.distribution
     arrays["document"] = np.array(json.dumps(document, sort_keys=True))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
@@ -112,30 +135,51 @@ def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
 
 
 def read_optimum(path: Path, key: str) -> Optimum:
-    """Read a solved problem; OptimumError where the file is damaged or another problem's."""
+    """Read a solved problem.
+
+    Args:
+        path: The file.
+        key: The `optimum_key` of the problem that it must hold.
+
+    Raises:
+        OptimumError: The file is damaged, or another problem's.
+    """
     try:
         arrays = read_arrays(path)
         document = json.loads(str(arrays.pop("document")))
-        axes = tuple(arrays[f"axis_{i}"] for i in range(sum(e.startswith("axis_") for e in arrays)))
-        smooth, figures, accuracy = (document[k] for k in ("smooth", "certificate", "accuracy"))
-        gain, lower, upper = (float(document[k]) for k in ("gain", "lower", "upper"))
-        nodes, penalty_nodes = (tuple(accuracy[k]) for k in ("nodes", "penalty_nodes"))
         if document["key"] != key:
             raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
-        return Optimum(
-            Grid(axes, smooth and tuple((float(a), float(b)) for a, b in smooth)),
-            **{name: arrays[name] for name in ("actions", "W", "distribution")},
-            gain=gain,
-            accuracy=Accuracy(int(accuracy["substeps"]), nodes, penalty_nodes),
-            lower=lower,
-            upper=upper,
-            certificate=tuple(Figure(**figure) for figure in figures or ()),
-        )
+        return _optimum_of(arrays, document)
     except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
         raise OptimumError(
             f"{path}: not a readable optimal policy ({error}); delete it to have the policy "
             "computed anew"
         ) from error
+
+
+def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optimum:
+    """The optimum in a file's arrays and document."""
+    count = sum(name.startswith("axis_") for name in arrays)
+    axes = tuple(arrays[f"axis_{i}"] for i in range(count))
+    smooth = document["smooth"]
+    if smooth:
+        smooth = tuple((float(first), float(last)) for first, last in smooth)
+    accuracy = document["accuracy"]
+    return Optimum(
+        Grid(axes, smooth),
+        actions=arrays["actions"],
+        W=arrays["W"],
+        distribution=arrays["distribution"],
+        gain=float(document["gain"]),
+        accuracy=Accuracy(
+            substeps=int(accuracy["substeps"]),
+            nodes=tuple(accuracy["nodes"]),
+            penalty_nodes=tuple(accuracy["penalty_nodes"]),
+        ),
+        lower=float(document["lower"]),
+        upper=float(document["upper"]),
+        certificate=tuple(Estimate(**estimate) for estimate in document["certificate"] or ()),
+    )
 
 
 # the optimal policy ---------------------------------------------------------------------------
@@ -151,13 +195,16 @@ class OptimalPolicy:
     name = "optimal"
 
     def __init__(self, plant: PlantProblem, optimum: Optimum) -> None:
-        self.problem, self.optimum = plant.problem, optimum
+        self.problem = plant.problem
+        self.optimum = optimum
         self._plant = plant
         self._axes = [axis.tolist() for axis in optimum.grid.axes]
         self._table = np.column_stack([optimum.actions, optimum.W]).tolist()
-        corners = itertools.product((0, 1), repeat=len(self._axes))
-        sizes = [len(axis) for axis in self._axes]
-        self._corners = [(c, int(np.ravel_multi_index(c, sizes))) for c in corners]
+        # A cell's corners, and how far each one's row in the table is behind that of the first.
+        self._corners = []
+        for corner in itertools.product((0, 1), repeat=len(self._axes)):
+            offset = int(np.ravel_multi_index(corner, optimum.grid.shape))
+            self._corners.append((corner, offset))
 
     @classmethod
     def from_scenario(
@@ -168,8 +215,13 @@ class OptimalPolicy:
     ) -> OptimalPolicy:
         """Optimal policy of a scenario: shipped, cached, or solved now and cached.
 
-        The plant is that of `PlantProblem.from_scenario`, whose errors are raised; OptimumError
-        also where a stored file is damaged.
+        Args:
+            scenario: The scenario; the plant is that of `PlantProblem.from_scenario`, whose errors
+                are raised.
+            progress: Called after each round of the solver.
+
+        Raises:
+            OptimumError: A stored file is damaged, or the problem is not solved.
         """
         plant = PlantProblem.from_scenario(scenario)
         key = optimum_key(plant, Settings())
@@ -188,9 +240,14 @@ class OptimalPolicy:
         """Do nothing."""
 
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
-        """π*(s) and V*(s), or Q*(s, a) with `a`; s (n,), a (m,); `clamped` outside the grid.
+        """π*(s) and V*(s), or Q*(s, a) where `a` is given; `clamped` outside the grid.
 
-        Raises QpError where s or a is not finite.
+        Args:
+            s: State in the model's units, (n,).
+            a: Action to enforce, (m,).
+
+        Raises:
+            QpError: s or a is not finite.
         """
         state: list[float] = np.asarray(s, dtype=np.float64).tolist()
         if len(state) != len(self._axes) or not isfinite(sum(state)):
@@ -206,7 +263,15 @@ class OptimalPolicy:
         return Decision(action, self.action_value(state, action), status, 0.0)
 
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
-        """Q*(s, a) = penalty(s) + E[ℓ − J* + V*(s₊)]."""
+        """Q*(s, a) = penalty(s) + E[ℓ − J* + V*(s₊)].
+
+        Args:
+            s: State in the model's units, (n,).
+            a: Action, (m,).
+
+        Raises:
+            QpError: a is not finite.
+        """
         state = np.array(s, dtype=np.float64).reshape(1, -1)
         action = np.array(a, dtype=np.float64).reshape(1, -1)
         if action.shape[1] != self.problem.n_actions or not np.isfinite(action).all():
@@ -224,12 +289,15 @@ class OptimalPolicy:
 
     def _lookup(self, state: list[float]) -> tuple[list[float], bool]:
         """Row (action…, W) interpolated at a state in plain Python: a tenth of NumPy's time."""
-        base, clamped, fractions = 0, False, []
+        base = 0  # row of the cell's first corner
+        clamped = False
+        fractions = []
         for x, axis in zip(state, self._axes, strict=True):
             cell = min(max(bisect_right(axis, x) - 1, 0), len(axis) - 2)
             fraction = (x - axis[cell]) / (axis[cell + 1] - axis[cell])
             if not 0.0 <= fraction <= 1.0:
-                fraction, clamped = min(max(fraction, 0.0), 1.0), True
+                fraction = min(max(fraction, 0.0), 1.0)
+                clamped = True
             base = base * len(axis) + cell
             fractions.append(fraction)
         row = [0.0] * len(self._table[0])
@@ -253,10 +321,9 @@ def fouling(scenario: Scenario) -> tuple[str, Callable[[ArrayLike], Vector]] | N
     OptimumError where there is no cleaning or no uncertain parameter.
     """
     given = scenario.plant.parameters
-    rate, floor, period = (
-        float(given.get(name, default))
-        for name, default in zip(FOULING, (0.0, 0.7, 0.0), strict=True)
-    )
+    rate = float(given.get("fouling_rate", 0.0))
+    floor = float(given.get("fouling_floor", 0.7))
+    period = float(given.get("cleaning_period", 0.0))
     if rate == 0.0 or floor == 1.0:
         return None
     if not period > 0.0:
@@ -271,7 +338,7 @@ def fouling(scenario: Scenario) -> tuple[str, Callable[[ArrayLike], Vector]] | N
     clean = _parameter(scenario, model, name)
 
     def value(time: ArrayLike) -> Vector:
-        since = np.mod(np.asarray(time) / DAY, period)
+        since = np.mod(np.asarray(time) / SECONDS_A_DAY, period)
         return np.asarray(clean * (floor + (1.0 - floor) * np.exp(-rate * since)))
 
     return name, value
@@ -298,43 +365,73 @@ def change_of(scenario: Scenario) -> Change | None:
 
     A parameter that fouls goes through six values, from fouled to clean, in a cycle of cleaning.
     """
-    fouled, changes = fouling(scenario), scenario.plant.changes
-    if fouled and changes:
+    fouled = fouling(scenario)
+    if fouled and scenario.plant.changes:
         raise OptimumError("a condenser that fouls and plant.changes have no common reference")
     if fouled:
-        name, value = fouled
-        cycle = DAY * scenario.plant.parameters["cleaning_period"]
-        # A microsecond before the cleaning, and after it.
-        nodes = np.linspace(value(cycle - 1e-6), value(0.0), NODES).round(6).tolist()
-        x, weights = np.polynomial.legendre.leggauss(40)
-        return Change(
-            [frozen(scenario, name, node) for node in nodes],
-            {name: nodes},
-            lambda time: np.asarray(np.interp(value(time), nodes, range(NODES)), dtype=np.float64),
-            times=0.5 * cycle * (x + 1.0),
-            weights=weights / 2.0,
-        )
-    if not changes:
-        return None
+        return _fouling_change(scenario, *fouled)
+    if scenario.plant.changes:
+        return _jumps(scenario, scenario.plant.changes)
+    return None
+
+
+def _fouling_change(scenario: Scenario, name: str, value: Callable[[ArrayLike], Vector]) -> Change:
+    """The change of a parameter that fouls, whose values at times in s are `value(time)`."""
+    cycle = SECONDS_A_DAY * scenario.plant.parameters["cleaning_period"]
+    # A microsecond before the cleaning, and after it.
+    fouled = value(cycle - 1e-6)
+    clean = value(0.0)
+    nodes = np.linspace(fouled, clean, FOULING_NODES).round(6).tolist()
+
+    def position(time: ArrayLike) -> Vector:
+        return np.asarray(np.interp(value(time), nodes, range(FOULING_NODES)), dtype=np.float64)
+
+    # The mean over a cycle, whose integrand is smooth, by Gauss–Legendre.
+    x, weights = np.polynomial.legendre.leggauss(40)
+    return Change(
+        plants=[frozen(scenario, name, node) for node in nodes],
+        parameters={name: nodes},
+        position=position,
+        times=0.5 * cycle * (x + 1.0),
+        weights=weights / 2.0,
+    )
+
+
+def _jumps(scenario: Scenario, changes: Sequence[ChangeTable]) -> Change:
+    """The changes of `plant.changes`, between which the plant stays as it is."""
     model = load_model(scenario.plant.model or scenario.controller.model)
-    names = dict.fromkeys(name for change in changes for name in change.parameters)
     starts = np.array([0.0, *(change.time for change in changes)])
     plants = [scenario.at(start) for start in starts.tolist()]
+    parameters: dict[str, Sequence[float]] = {}
+    for change in changes:
+        for name in change.parameters:
+            parameters[name] = [_parameter(plant, model, name) for plant in plants]
+
+    def position(time: ArrayLike) -> Vector:
+        return np.asarray(np.searchsorted(starts, time, side="right") - 1, dtype=np.float64)
+
     return Change(
-        plants,
-        {name: [_parameter(plant, model, name) for plant in plants] for name in names},
-        lambda time: np.asarray(np.searchsorted(starts, time, side="right") - 1, dtype=np.float64),
+        plants=plants,
+        parameters=parameters,
+        position=position,
         times=starts[:-1],
         weights=np.diff(starts) / starts[-1],
     )
 
 
 def frozen(scenario: Scenario, name: str, value: float) -> Scenario:
-    """The scenario without fouling, its fouled parameter at a value."""
+    """The scenario without fouling, its fouled parameter at a value.
+
+    Args:
+        scenario: The scenario.
+        name: The parameter that fouls.
+        value: Its value, in the model's unit.
+    """
     document = scenario.to_dict()
-    given = document["plant"]["parameters"]
-    kept = {key: each for key, each in given.items() if key not in FOULING}
-    document["plant"]["parameters"] = kept | {name: value}
+    parameters = document["plant"]["parameters"]
+    for fouling_parameter in FOULING_PARAMETERS:
+        parameters.pop(fouling_parameter, None)
+    parameters[name] = value
     return Scenario.from_dict(document)
 
 
@@ -366,7 +463,15 @@ class QuasiStaticPolicy:
     def from_scenario(
         cls, scenario: Scenario, *, progress: Progress | None = None
     ) -> QuasiStaticPolicy:
-        """Policy of a changing scenario; solves missing optima. Raises OptimumError."""
+        """Policy of a scenario whose plant changes; optima that are not stored are solved.
+
+        Args:
+            scenario: The scenario.
+            progress: Called after each round of the solver.
+
+        Raises:
+            OptimumError: The plant changes in two ways, or an optimum is not solved.
+        """
         law = change_of(scenario)
         assert law is not None
         policies = [OptimalPolicy.from_scenario(plant, progress=progress) for plant in law.plants]
@@ -387,8 +492,8 @@ class QuasiStaticPolicy:
         from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second
 
         nodes = np.arange(len(self.policies))
-        found: Vector = PchipInterpolator(nodes, self.gains)(self.law.position(time))
-        return found
+        gains: Vector = PchipInterpolator(nodes, self.gains)(self.law.position(time))
+        return gains
 
     def reset(self) -> None:
         """Start the clock."""
@@ -399,16 +504,22 @@ class QuasiStaticPolicy:
         self._sample += 1
 
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
-        """Action and value at s (n,) for the plant as it is; raises QpError as each does."""
+        """Action and value for the plant as it is at the time; raises QpError as each policy does.
+
+        Args:
+            s: State in the model's units, (n,).
+            a: Action to enforce, (m,).
+        """
         share, lower = modf(self.law.position(max(self._sample, 0) * self._h))
         first = self.policies[int(lower)].feedback(s, a)
         if share == 0.0:
             return first
         second = self.policies[int(lower) + 1].feedback(s, a)
+        clamped = "clamped" in (first.status, second.status)
         return Decision(
             (1.0 - share) * first.action + share * second.action,
             (1.0 - share) * first.value + share * second.value,
-            "clamped" if "clamped" in (first.status, second.status) else "solved",
+            "clamped" if clamped else "solved",
             0.0,
         )
 
@@ -421,10 +532,12 @@ def stored_optimum(scenario: Scenario) -> str | None:
     """
     if is_file(scenario.plant.fmu) and scenario.plant.model is None:
         return None
-    law = change_of(scenario)
-    try:
-        plants = [PlantProblem.from_scenario(each) for each in (law.plants if law else [scenario])]
-    except (ModelError, OptimumError):
-        return None
-    stored = all(stored_file(optimum_key(plant, Settings())) for plant in plants)
-    return "optimal" if stored else None
+    change = change_of(scenario)
+    for plant in change.plants if change else [scenario]:
+        try:
+            problem = PlantProblem.from_scenario(plant)
+        except (ModelError, OptimumError):
+            return None
+        if stored_file(optimum_key(problem, Settings())) is None:
+            return None
+    return "optimal"

@@ -9,17 +9,14 @@ from typing import Literal
 import casadi as ca
 import daqp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from controllers.errors import ModelError, OptimumError
 from controllers.model import Model
-from controllers.qp import FIXED, MEANING, SETTINGS
+from controllers.qp import DAQP_FIXED, DAQP_SETTINGS, DAQP_STATUS, Mask
 from cosim.core.modules import exception_line, load_plugin
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import Penalty, Scenario
-
-Mask = NDArray[np.bool_]
-
 
 VECTORS = (
     *("state_lower", "state_upper", "action_lower", "action_upper"),
@@ -165,13 +162,13 @@ def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Ve
         rows,
         np.r_[np.where(above, 0.0, np.inf), np.zeros(equations)],
         np.r_[np.where(below, 0.0, -np.inf), np.zeros(equations)],
-        np.repeat(np.array([0, FIXED], dtype=np.int32), [inequalities, equations]),
-        **SETTINGS,
+        np.repeat(np.array([0, DAQP_FIXED], dtype=np.int32), [inequalities, equations]),
+        **DAQP_SETTINGS,
     )
     if flag <= 0:
         raise ModelError(
             "problem: the multipliers of the bounds at the reference cannot be computed "
-            f"({MEANING.get(flag, flag)}); look at the derivatives of cost and model there"
+            f"({DAQP_STATUS.get(flag, flag)}); look at the derivatives of cost and model there"
         )
     return np.asarray(np.abs(info["lam"][:inequalities]) * size)
 

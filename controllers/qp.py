@@ -51,6 +51,18 @@ class SoftQp:
         return copy.deepcopy(self)
 
 
+class ActiveSet(NamedTuple):
+    """Masks of the active constraints of a `SoftQp` with d variables and c rows.
+
+    `at_bound` (d,) are the variables at a bound, fixed ones among them; `at_limit` (c,) the rows at
+    their limit, `violated` (c,) those beyond it, whose slack is positive.
+    """
+
+    at_bound: Mask
+    at_limit: Mask
+    violated: Mask
+
+
 class QpSolution(NamedTuple):
     """Primal-dual solution `v`, `nu`, `lam`: Hv + f + ν + Γᵀλ = 0.
 
@@ -71,17 +83,28 @@ class QpSolution(NamedTuple):
         with y = Γv and the soft bound Σ t + (W/w) t²: the latter two measure feasibility, sign and
         complementarity at once. A change of the cost's unit does not change it.
         """
-        v, nu, lam = self
-        curvature, pull, y = qp.H @ v, lam @ qp.rows, qp.rows @ v
-        terms = np.abs(np.array([qp.f, curvature, pull, nu, qp.H.diagonal()]))
+        v = self.v
+        curvature = qp.H @ v
+        pull = self.lam @ qp.rows
+        y = qp.rows @ v
+
+        terms = np.abs(np.array([qp.f, curvature, pull, self.nu, qp.H.diagonal()]))
         sizes = np.maximum(terms.max(axis=0), 1e-30)
-        stationarity = np.abs(curvature + qp.f + nu + pull) / sizes
-        bounds = np.abs(v - np.minimum(np.maximum(v + nu / sizes, qp.lower), qp.upper))
-        moved = y + lam / qp.w
-        nearest = np.minimum(np.maximum(moved, qp.row_lower), qp.row_upper)
-        beyond = moved - nearest
-        shrunk = np.maximum(np.abs(beyond) - 1.0, 0.0) / (1 + 2 * qp.W / qp.w)
-        rows = np.abs(y - (nearest + np.copysign(shrunk, beyond))) / (1 + np.abs(y))
+        stationarity = np.abs(curvature + qp.f + self.nu + pull) / sizes
+
+        # (v, ν) is optimal in the bounds exactly where v is the projection of v + ν/σ on them.
+        projection = np.minimum(np.maximum(v + self.nu / sizes, qp.lower), qp.upper)
+        bounds = np.abs(v - projection)
+
+        # The proximal operator of the soft bound: within the limits nothing is charged; one unit
+        # of λ/w beyond them stays at the limit, and what is further out is violated.
+        shifted = y + self.lam / qp.w
+        nearest = np.minimum(np.maximum(shifted, qp.row_lower), qp.row_upper)
+        beyond = shifted - nearest
+        violation = np.maximum(np.abs(beyond) - 1.0, 0.0) / (1 + 2 * qp.W / qp.w)
+        proximal = nearest + np.copysign(violation, beyond)
+        rows = np.abs(y - proximal) / (1 + np.abs(y))
+
         return float(max(stationarity.max(), bounds.max(), rows.max(initial=0.0)))
 
     def weakly_active(self, qp: SoftQp, tolerance: float = 2e-8) -> bool:
@@ -91,47 +114,58 @@ class QpSolution(NamedTuple):
         multiplier is below `tolerance`·max(‖diag H‖∞, ‖multipliers‖∞), a row's also if that is as
         close to w, or if no free variable moves the row. Derivatives of the solution are then
         one-sided.
-        """
-        v, nu, lam = self
-        curvature = float(qp.H.diagonal().max())
-        small = tolerance * max(curvature, float(np.abs(nu).max()))
-        free = qp.lower != qp.upper
-        at_bound = np.minimum(v - qp.lower, qp.upper - v) < tolerance * (1 + np.abs(v))
-        if (free & at_bound & (np.abs(nu) < small)).any():
-            return True
-        y = qp.rows @ v
-        at_limit = np.minimum(np.abs(y - qp.row_lower), np.abs(y - qp.row_upper)) < tolerance * (
-            1 + np.abs(y)
-        )
-        size = np.abs(lam)
-        undecided = (size < tolerance * np.maximum(curvature, size.max(initial=0.0))) | (
-            np.abs(size - qp.w) < tolerance * qp.w
-        )
-        moved = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0) > 0
-        return bool((at_limit & (undecided | ~moved)).any())
 
-    def active(self, qp: SoftQp) -> tuple[Mask, Mask, Mask]:
-        """Masks: variables held by a bound, rows held at a limit, rows violated.
+        Args:
+            qp: The QP that this solves.
+            tolerance: Relative distance within which a limit is reached and a multiplier zero.
+
+        Returns:
+            True where a derivative of the solution is one-sided.
+        """
+        curvature = float(qp.H.diagonal().max())
+        free = qp.lower != qp.upper
+
+        small = tolerance * max(curvature, float(np.abs(self.nu).max()))
+        distance = np.minimum(self.v - qp.lower, qp.upper - self.v)
+        at_bound = distance < tolerance * (1 + np.abs(self.v))
+        if (free & at_bound & (np.abs(self.nu) < small)).any():
+            return True
+
+        y = qp.rows @ self.v
+        distance = np.minimum(np.abs(y - qp.row_lower), np.abs(y - qp.row_upper))
+        at_limit = distance < tolerance * (1 + np.abs(y))
+        size = np.abs(self.lam)
+        # Two events: the row leaves its limit (λ = 0), or it begins to be violated (|λ| = w).
+        leaving = size < tolerance * np.maximum(curvature, size.max(initial=0.0))
+        yielding = np.abs(size - qp.w) < tolerance * qp.w
+        movable = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0) > 0
+        return bool((at_limit & (leaving | yielding | ~movable)).any())
+
+    def active(self, qp: SoftQp) -> ActiveSet:
+        """The active set: variables at a bound, rows at a limit, rows violated.
 
         They are the branches of proximal operators as in `residual`: of a distance and its
         multiplier, relative to the curvature H_jj or to w, the larger decides, which is unsafe
         where `weakly_active`.
         """
-        v, nu, lam = self
-        push = np.abs(nu) / np.maximum(np.abs(qp.H.diagonal()), 1e-30)
-        held = (qp.lower == qp.upper) | (np.minimum(v - qp.lower, qp.upper - v) < push)
-        y, size = qp.rows @ v, np.abs(lam) / qp.w
+        push = np.abs(self.nu) / np.maximum(np.abs(qp.H.diagonal()), 1e-30)
+        distance = np.minimum(self.v - qp.lower, qp.upper - self.v)
+        at_bound = (qp.lower == qp.upper) | (distance < push)
+
+        y = qp.rows @ self.v
+        size = np.abs(self.lam) / qp.w
         outside = np.maximum(qp.row_lower - y, y - qp.row_upper)
         violated = size + outside > 1
-        return held, ~violated & (size + outside > 0), violated
+        at_limit = ~violated & (size + outside > 0)
+        return ActiveSet(at_bound, at_limit, violated)
 
     def licq_margin(self, qp: SoftQp) -> float:
         """Least singular value of the active constraints' normalised gradients; ∞ without any.
 
         Zero means that the linear independence constraint qualification fails.
         """
-        held, at_limit, _ = self.active(qp)
-        gradients = qp.rows[at_limit][:, ~held]
+        active = self.active(qp)
+        gradients = qp.rows[active.at_limit][:, ~active.at_bound]
         if gradients.shape[0] == 0:
             return np.inf
         if gradients.shape[0] > gradients.shape[1]:
@@ -140,7 +174,8 @@ class QpSolution(NamedTuple):
         return float(np.linalg.svd(gradients / norms, compute_uv=False)[-1])
 
 
-TOLERANCE = 1e-8
+KINK_TOLERANCE = 1e-8
+"""Relative distance within which x_1 counts as on a soft bound, and an action as on its bound."""
 
 
 def multipliers_at_kink(
@@ -151,105 +186,154 @@ def multipliers_at_kink(
     With u_0 = a enforced, x_1 is known. Where it lies on a soft bound, as it often does at
     a = π(s), Q has a kink: that row's multiplier may be anything in [0, w], and every backend
     returns another one. Those chosen here minimise ‖dQ/da‖ over the components of `a` strictly
-    between the actuators' bounds `lower` and `upper` (m,); at a = π(s) they are those of V(s). The
-    first n rows of the QP must be x_1.
+    between the actuators' bounds; at a = π(s) they are those of V(s).
+
+    Args:
+        qp: The QP with u_0 fixed. Its first n rows must be x_1, its first m variables u_0.
+        solution: Its solution, with any of the multipliers.
+        lower: Lower bounds of the actions in units of the QP, (m,).
+        upper: Their upper bounds, (m,).
+
+    Returns:
+        The solution with the multipliers chosen; `solution` itself where there is no kink.
     """
-    v, nu, lam = solution
-    m, n = lower.size, qp.w.size * lower.size // v.size
-    first = qp.rows[:n, :m]
-    y = first @ v[:m]
-    below, above = np.abs(y - qp.row_lower[:n]), np.abs(y - qp.row_upper[:n])
-    near = np.minimum(below, above) < TOLERANCE * (1 + np.abs(y))
+    m = lower.size
+    # As many rows as states and as many variables as actions, N times each.
+    n = qp.w.size * m // solution.v.size
+    action = solution.v[:m]
+    first_rows = qp.rows[:n, :m]
+    y = first_rows @ action
+    below = np.abs(y - qp.row_lower[:n])
+    above = np.abs(y - qp.row_upper[:n])
+    near = np.minimum(below, above) < KINK_TOLERANCE * (1 + np.abs(y))
     if not near.any():
         return solution
-    rows, action, width = first[near], v[:m], TOLERANCE * (1 + np.abs(v[:m]))
+
+    kinked = first_rows[near]
+    width = KINK_TOLERANCE * (1 + np.abs(action))
     inside = (action > lower + width) & (action < upper - width)
-    total = nu[:m] + lam[:n][near] @ rows
-    chosen = np.linalg.lstsq(rows[:, inside].T, total[inside])[0]
-    w, over = qp.w[:n][near], (above < below)[near]
-    nu, lam = nu.copy(), lam.copy()
-    lam[:n][near] = np.clip(chosen, np.where(over, 0, -w), np.where(over, w, 0))
-    nu[:m] = total - lam[:n][near] @ rows
-    return QpSolution(v, nu, lam)
+    # ν + Γᵀλ is fixed by stationarity; what the rows do not take, −ν, is dQ/da.
+    total = solution.nu[:m] + solution.lam[:n][near] @ kinked
+    least_squares = np.linalg.lstsq(kinked[:, inside].T, total[inside])[0]
 
-
-STEPS = 10
+    w = qp.w[:n][near]
+    at_upper = (above < below)[near]
+    nu = solution.nu.copy()
+    lam = solution.lam.copy()
+    lam[:n][near] = np.clip(least_squares, np.where(at_upper, 0, -w), np.where(at_upper, w, 0))
+    nu[:m] = total - lam[:n][near] @ kinked
+    return QpSolution(solution.v, nu, lam)
 
 
 def kkt_solve(
-    qp: SoftQp, active: tuple[Mask, Mask, Mask], seeds: Matrix, limits: Matrix
+    qp: SoftQp, active: ActiveSet, seeds: Matrix, limits: Matrix
 ) -> tuple[Matrix, Matrix]:
     """Solve the KKT system of an active set for several right-hand sides, one a row.
 
-    `active` is that of `QpSolution.active`. Held variables stay at zero, rows at their limit take
-    the values `limits` (k, rows), a violated row adds its quadratic weight to the Hessian. `seeds`
-    (k, variables) are the right-hand sides of stationarity. Returns the variables (k, variables)
-    and the multipliers of the rows at their limit (k, rows), zero elsewhere; a singular system
-    (LICQ fails) is solved by least squares.
+    Variables at a bound stay at zero, and a violated row adds its quadratic weight to the Hessian.
+    A singular system, where LICQ fails, is solved by least squares.
+
+    Args:
+        qp: The QP with d variables and c rows.
+        active: Its active set.
+        seeds: Right-hand sides of stationarity, (k, d).
+        limits: Values of the rows at their limit, (k, c); those of other rows are not read.
+
+    Returns:
+        The variables (k, d), and the multipliers of the rows at their limit (k, c), zero elsewhere.
     """
-    held, at_limit, violated = active
-    free = ~held
-    H, rows = qp.H[free][:, free], qp.rows[:, free]
-    equal, outside = rows[at_limit], rows[violated]
-    size, count = len(H), len(equal)
+    free = ~active.at_bound
+    H = qp.H[free][:, free]
+    rows = qp.rows[:, free]
+    equal = rows[active.at_limit]
+    outside = rows[active.violated]
+    size = len(H)
+    count = len(equal)
+
     # Column-major, as LAPACK wants it.
     kkt = np.zeros((size + count, size + count), order="F")
-    right = np.empty((size + count, len(seeds)), order="F")
     kkt[:size, :size] = H
     if len(outside):
-        kkt[:size, :size] += 2 * (outside.T * qp.W[violated]) @ outside
-    kkt[:size, size:], kkt[size:, :size] = equal.T, equal
+        kkt[:size, :size] += 2 * (outside.T * qp.W[active.violated]) @ outside
+    kkt[:size, size:] = equal.T
+    kkt[size:, :size] = equal
+    right = np.empty((size + count, len(seeds)), order="F")
     right[:size] = seeds[:, free].T
-    right[size:] = limits[:, at_limit].T
+    right[size:] = limits[:, active.at_limit].T
+
     answer = right
-    if len(kkt):  # every variable may be held
+    if len(kkt):  # every variable may be at a bound
         # SciPy is imported where it is needed: it is a quarter of a short run.
         from scipy.linalg.lapack import dgesv  # noqa: PLC0415
 
         _, _, answer, status = dgesv(kkt, right)
         if status != 0:
             answer = np.asarray(np.linalg.lstsq(kkt, right)[0], dtype=np.float64)
-    v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)
-    v[:, free], lam[:, at_limit] = answer[:size].T, answer[size:].T
+
+    v = np.zeros(seeds.shape)
+    v[:, free] = answer[:size].T
+    lam = np.zeros(limits.shape)
+    lam[:, active.at_limit] = answer[size:].T
     return v, lam
+
+
+MAX_NEWTON_STEPS = 10
+"""Most Newton steps of `polish`; two or three are the rule."""
 
 
 def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-12) -> QpSolution:
     """Bring an approximate solution to a residual below `accuracy` by a few Newton steps.
 
     Each step solves exactly for the iterate's active set (a primal-dual active-set method, that is
-    semismooth Newton on the proximal residuals). Returns the iterate with the least residual.
+    semismooth Newton on the proximal residuals).
+
+    Args:
+        qp: The QP.
+        solution: An approximate solution, whose active set is nearly the right one.
+        accuracy: Residual (`QpSolution.residual`) below which no more steps are made.
+
+    Returns:
+        The iterate with the least residual.
     """
-    best, least = solution, solution.residual(qp)
-    for _ in range(STEPS):
+    best = solution
+    least = solution.residual(qp)
+    for _ in range(MAX_NEWTON_STEPS):
         if least < accuracy:
             break
         solution = _newton_step(qp, solution)
         residual = solution.residual(qp)
         if residual < least:
-            best, least = solution, residual
+            best = solution
+            least = residual
     return best
 
 
 def _newton_step(qp: SoftQp, solution: QpSolution) -> QpSolution:
-    held, _, violated = active = solution.active(qp)
-    upwards = solution.lam > 0
-    limit = np.where(upwards, qp.row_upper, qp.row_lower)
-    base = np.where(held, np.where(solution.nu > 0, qp.upper, qp.lower), 0.0)
-    push = np.where(violated, np.where(upwards, qp.w, -qp.w), 0.0)
-    weight = np.where(violated, 2 * qp.W, 0.0)
-    fixed = qp.rows @ base - limit
-    seed = -(qp.H @ base + qp.f + (push + weight * fixed) @ qp.rows)
-    moved, lam = kkt_solve(qp, active, seed[None], -fixed[None])
-    v = base + moved[0]
-    multipliers = lam[0] + push + weight * (qp.rows @ v - limit)
-    nu = np.where(held, -(qp.H @ v + qp.f + multipliers @ qp.rows), 0.0)
-    return QpSolution(v, nu, multipliers)
+    """The KKT point of the solution's active set, whether or not it is the right one."""
+    active = solution.active(qp)
+    above = solution.lam > 0
+    limit = np.where(above, qp.row_upper, qp.row_lower)
+    # The variables at a bound are known; those that are free are counted from zero.
+    base = np.where(active.at_bound, np.where(solution.nu > 0, qp.upper, qp.lower), 0.0)
+    # λ = ±w + 2W(Γv − limit) of a violated row: the first part is known, the second is curvature.
+    push = np.where(active.violated, np.where(above, qp.w, -qp.w), 0.0)
+    weight = np.where(active.violated, 2 * qp.W, 0.0)
+
+    excess = qp.rows @ base - limit
+    seed = -(qp.H @ base + qp.f + (push + weight * excess) @ qp.rows)
+    step, lam_at_limit = kkt_solve(qp, active, seed[None], -excess[None])
+
+    v = base + step[0]
+    lam = lam_at_limit[0] + push + weight * (qp.rows @ v - limit)
+    nu = np.where(active.at_bound, -(qp.H @ v + qp.f + lam @ qp.rows), 0.0)
+    return QpSolution(v, nu, lam)
 
 
-SOFT, FIXED = 8, 5
-SETTINGS = {"primal_tol": 1e-10, "dual_tol": 1e-12}
-MEANING = {
+# DAQP's marks of a soft row and of an equation, its tolerances, and what its exit flags mean.
+DAQP_SOFT = 8
+DAQP_FIXED = 5
+DAQP_SETTINGS = {"primal_tol": 1e-10, "dual_tol": 1e-12}
+DAQP_STATUS = {
     -1: "infeasible",
     -2: "cycling",
     -3: "unbounded",
@@ -301,64 +385,78 @@ class DaqpBackend:
 
     def load(self, qp: SoftQp) -> None:
         """Factorise H and transform the rows; the first call allocates the workspace."""
-        n, rows = qp.f.size, qp.w.size
         if self._model is None:
-            self._lower, self._upper = np.zeros((2, n + rows))
-            self._free = np.repeat(np.array([0, SOFT], dtype=np.int32), [n, rows])
-            self._sense = self._free.copy()
-            self._model = daqp.Model()
-            self._model.settings = SETTINGS
+            self._set_up(qp)
+            return
+        # New weights are recognised by their arrays: a comparison of values would cost more.
+        if self._w is not qp.w or self._W is not qp.W:
+            self._write_weights(qp)
+        if self._failed:  # an update is refused while the limits of a failed QP stand
             self._write_limits(qp)
-            self._factorised, _ = self._model.setup(
-                qp.H, qp.f, qp.rows, self._upper, self._lower, self._sense
-            )
-            self._weights(qp)
-        else:
-            if self._weighed[0] is not qp.w or self._weighed[1] is not qp.W:
-                self._weights(qp)
-            if self._failed:  # an update is refused while the limits of a failed QP stand
-                self._write_limits(qp)
-            self._factorised = self._model.update(
-                H=qp.H, A=qp.rows, bupper=self._upper, blower=self._lower, sense=self._free
-            )
+        self._factorised = self._model.update(
+            H=qp.H, A=qp.rows, bupper=self._upper, blower=self._lower, sense=self._free
+        )
 
-    def _weights(self, qp: SoftQp) -> None:
-        self._weighed = (qp.w, qp.W)
+    def _set_up(self, qp: SoftQp) -> None:
+        variables = qp.f.size
+        rows = qp.w.size
+        self._lower = np.zeros(variables + rows)
+        self._upper = np.zeros(variables + rows)
+        self._free = np.zeros(variables + rows, dtype=np.int32)
+        self._free[variables:] = DAQP_SOFT
+        self._sense = self._free.copy()
+        self._model = daqp.Model()
+        self._model.settings = DAQP_SETTINGS
+        self._write_limits(qp)
+        self._factorised, _ = self._model.setup(
+            qp.H, qp.f, qp.rows, self._upper, self._lower, self._sense
+        )
+        self._write_weights(qp)
+
+    def _write_weights(self, qp: SoftQp) -> None:
+        self._w = qp.w
+        self._W = qp.W
+        # DAQP's softened constraints have the linear price w_l and the compliance rho_l = 1/(2W);
+        # it wants numbers for the bounds too, which are hard, and does not read them.
         unused = np.ones(qp.f.size)
-        linear, compliance = np.r_[unused, qp.w], np.r_[unused, 0.5 / qp.W]
+        linear = np.concatenate([unused, qp.w])
+        compliance = np.concatenate([unused, 0.5 / qp.W])
         self._model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
 
     def _write_limits(self, qp: SoftQp) -> None:
-        n = qp.f.size
-        self._lower[:n], self._lower[n:] = qp.lower, qp.row_lower
-        self._upper[:n], self._upper[n:] = qp.upper, qp.row_upper
+        variables = qp.f.size
+        self._lower[:variables] = qp.lower
+        self._lower[variables:] = qp.row_lower
+        self._upper[:variables] = qp.upper
+        self._upper[variables:] = qp.row_upper
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the vectors of `qp`; raises QpError where DAQP does not."""
-        n, flag = qp.f.size, self._factorised
+        variables = qp.f.size
+        flag = self._factorised
         self._failed = True
         if flag >= 0:
             self._write_limits(qp)
-            np.multiply(qp.lower == qp.upper, FIXED, out=self._sense[:n])
+            np.multiply(qp.lower == qp.upper, DAQP_FIXED, out=self._sense[:variables])
             flag = self._model.update(
                 f=qp.f, bupper=self._upper, blower=self._lower, sense=self._sense
             )
         if flag >= 0:
             v, _, flag, info = self._model.solve()
         if flag <= 0:
-            status = MEANING.get(flag, f"exit flag {flag}")
+            status = DAQP_STATUS.get(flag, f"exit flag {flag}")
             raise QpError(f"DAQP did not solve the QP: {status}", status=status, qp=qp.copy())
         self._failed = False
         multipliers = info["lam"]
-        return QpSolution(v, multipliers[:n], multipliers[n:])
+        return QpSolution(v, multipliers[:variables], multipliers[variables:])
 
 
-ENOUGH = 1e-9
-"""Residual of a polished solution that is one."""
+POLISHED_RESIDUAL = 1e-9
+"""Largest residual of a polished solution that counts as one."""
 
 # Options of each attempt. ProxQP 0.8.0 takes some feasible QPs for infeasible, others with and
 # without the switch.
-ATTEMPTS: dict[str, list[dict[str, Any]]] = {
+SOLVER_ATTEMPTS: dict[str, list[dict[str, Any]]] = {
     "proxqp": [
         {"eps_abs": 1e-9, "eps_rel": 0.0},
         {"eps_abs": 1e-9, "eps_rel": 0.0, "primal_infeasibility_solving": True},
@@ -397,26 +495,35 @@ class QpsolversBackend:
         import qpsolvers  # noqa: PLC0415
 
         problem = qpsolvers_problem(qp, dense=self._solver in qpsolvers.dense_solvers)
-        rows, fixed = qp.w.size, np.flatnonzero(qp.lower == qp.upper)
         reason = "not solved"
-        for options in ATTEMPTS.get(self._solver, [{}]):
+        for options in SOLVER_ATTEMPTS.get(self._solver, [{}]):
             try:
-                found = qpsolvers.solve_problem(problem, solver=self._solver, **options)
+                answer = qpsolvers.solve_problem(problem, solver=self._solver, **options)
             except qpsolvers.QPError as error:
                 reason = str(error)
                 continue
-            if found.x is None or not np.isfinite(found.x).all():
+            if answer.x is None or not np.isfinite(answer.x).all():
                 continue
-            z, box = np.asarray(found.z), np.asarray(found.z_box).copy()
-            box[fixed] = np.asarray(found.y)
-            v = np.asarray(found.x)[: qp.f.size]
-            solution = polish(qp, QpSolution(v, box[: v.size], z[rows:] - z[:rows]))
+            solution = polish(qp, _read_answer(qp, answer))
             # A solver may say that it failed where it is near: what it says is not looked at.
-            if solution.residual(qp) < ENOUGH:
+            if solution.residual(qp) < POLISHED_RESIDUAL:
                 return solution
         raise QpError(
             f"{self._solver} did not solve the QP: {reason}", status="not solved", qp=qp.copy()
         )
+
+
+def _read_answer(qp: SoftQp, answer: qpsolvers.Solution) -> QpSolution:
+    """The primal-dual solution of `qp` in that of `qpsolvers_problem(qp)`."""
+    variables = qp.f.size
+    rows = qp.w.size
+    v = np.asarray(answer.x)[:variables]
+    # A fixed variable is an equation there, and its multiplier that of the equation.
+    box = np.asarray(answer.z_box).copy()
+    box[np.flatnonzero(qp.lower == qp.upper)] = np.asarray(answer.y)
+    # Two inequalities a row: first those of the lower limits, then those of the upper ones.
+    z = np.asarray(answer.z)
+    return QpSolution(v, box[:variables], z[rows:] - z[:rows])
 
 
 def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
@@ -427,19 +534,35 @@ def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
 
     with the slack t_i = τ_i h/w_i, h = max_j H_jj, in such units that its price is h: ProxQP takes
     QPs for infeasible whose prices are many times their curvature.
+
+    Args:
+        qp: The QP with d variables and c rows.
+        dense: Whether the matrices are NumPy's; SciPy's sparse ones else.
+
+    Returns:
+        A problem in d + c variables.
     """
     import qpsolvers  # noqa: PLC0415
     import scipy.sparse as sp  # noqa: PLC0415
 
-    n, rows = qp.f.size, qp.w.size
-    fixed, free = qp.lower == qp.upper, np.full(rows, np.inf)
+    variables = qp.f.size
+    rows = qp.w.size
+    fixed = qp.lower == qp.upper
     slack = qp.H.diagonal().max() / qp.w
     unit = np.diag(slack)
-    P = np.zeros((n + rows, n + rows))
-    P[:n, :n], P[n:, n:] = qp.H, np.diag(2 * qp.W * slack**2)
-    G, h = np.block([[-qp.rows, -unit], [qp.rows, -unit]]), np.r_[-qp.row_lower, qp.row_upper]
-    A, b = np.eye(n, n + rows)[fixed], qp.lower[fixed]
-    lower = np.r_[np.where(fixed, -np.inf, qp.lower), np.zeros(rows)]
-    upper = np.r_[np.where(fixed, np.inf, qp.upper), free]
-    P, G, A = (each if dense else sp.csc_matrix(each) for each in (P, G, A))
-    return qpsolvers.Problem(P, np.r_[qp.f, qp.w * slack], G, h, A, b, lower, upper)
+
+    P = np.zeros((variables + rows, variables + rows))
+    P[:variables, :variables] = qp.H
+    P[variables:, variables:] = np.diag(2 * qp.W * slack**2)
+    q = np.concatenate([qp.f, qp.w * slack])
+    G = np.block([[-qp.rows, -unit], [qp.rows, -unit]])
+    h = np.concatenate([-qp.row_lower, qp.row_upper])
+    A = np.eye(variables, variables + rows)[fixed]
+    b = qp.lower[fixed]
+    lower = np.concatenate([np.where(fixed, -np.inf, qp.lower), np.zeros(rows)])
+    upper = np.concatenate([np.where(fixed, np.inf, qp.upper), np.full(rows, np.inf)])
+    if not dense:
+        P = sp.csc_matrix(P)
+        G = sp.csc_matrix(G)
+        A = sp.csc_matrix(A)
+    return qpsolvers.Problem(P, q, G, h, A, b, lower, upper)

@@ -7,7 +7,7 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache
 
 import casadi as ca
@@ -20,239 +20,278 @@ from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
 from cosim.core.protocols import Matrix
 
-SOLUTION = ("xi", "t", "chi", "v", "lam")
+SOLUTION_PARTS = ("xi", "t", "chi", "v", "lam")
 """First inputs of the sensitivities: a solution's parts."""
 
 
-def _theta_part(
-    problem: Problem, symbols: Symbols, y: Mapping[str, ca.SX], at: ca.SX, M: ca.SX | None
+def _theta_lagrangian(
+    problem: Problem,
+    symbols: Symbols,
+    y: Mapping[str, ca.SX],
+    points: ca.SX,
+    M: ca.SX | None,
 ) -> ca.SX:
-    """Terms of the Lagrangian with θ but for p; `at` (n+m, N), M_k = ∂(second-order term)/∂L_k.
-
-    The solution y has `xi`, `chi` (n, N+1), `v` (m, N), slack `t` and `lam` (n, N).
-    """
-    horizon, gamma, size = problem.horizon, problem.discount, at.size1()
-    reference = problem.reference
-    part = ca.bilin(symbols["B_lambda"], y["xi"][:, 0]) + ca.dot(symbols["b_lambda"], y["xi"][:, 0])
-    part += symbols["c_lambda"]
-    for k in range(horizon):
-        w = ca.vertcat(y["xi"][:, k], y["v"][:, k])
-        stage = ca.dot(symbols["b_l"], w)
-        if M is None:
-            stage += ca.bilin(symbols["B_l"], w)
-        else:
-            point, M_k = at[:, k] - reference, M[:, k * size : (k + 1) * size]
-            stage += ca.bilin(symbols["B_l"], point, 2 * w - point)
-            stage += 2 * ca.dot(M_k, symbols["B_l"])
-        part += gamma**k * stage + ca.dot(y["chi"][:, k + 1], symbols["c_f"])
-        part += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], y["t"][:, k])
-        part += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], y["t"][:, k] ** 2)
-        part += ca.dot(ca.fmax(-y["lam"][:, k], 0), symbols["x_l"])
-        part -= ca.dot(ca.fmax(y["lam"][:, k], 0), symbols["x_u"])
-    end = y["xi"][:, horizon]
-    return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
-
-
-def _stage_arguments(
-    problem: Problem, inputs: Mapping[str, ca.MX], *, exact: bool
-) -> dict[str, ca.MX]:
-    """Arguments of `stage_parameter_gradient`, those of stage 0, 1, … side by side."""
-    horizon, scale = problem.horizon, problem.scale
-    v = inputs["v"] * ca.repmat(ca.DM(scale.action), 1, horizon)
-    w = ca.vertcat(inputs["xi"][:, :horizon], v) + ca.repmat(ca.DM(problem.reference), 1, horizon)
-    arguments = {
-        "x": inputs["x"],
-        "u": inputs["u"],
-        "theta": ca.repmat(inputs["theta"], 1, horizon),
-        "w": w,
-        "chi": inputs["chi"][:, 1:],
-    }
-    if exact:
-        arguments |= {"M": inputs["M"], "guess": inputs["guess"]}
-    return arguments
-
-
-def _value_gradient_by_stages(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    inputs: Mapping[str, ca.SX],
-    results: Mapping[str, ca.SX],
-    *,
-    exact: bool,
-) -> StackedFunction:
-    """The value's gradient with that in p, the sum of a function of one stage over the horizon.
+    """Terms of the QP's Lagrangian that hold θ, all but those of the model's parameters p.
 
     Args:
-        problem: the control problem.
-        blocks: the blocks of θ, p among them.
-        inputs: arguments of the gradient by name.
-        results: `gradient` (n_θ), in which the part of p is missing.
-        exact: whether the QP's Hessian is the exact one.
-
-    Returns:
-        The function of the same inputs with the whole gradient.
-    """
-    rest = stage_function("value_gradient_rest", inputs, results)
-    symbols = {name: ca.MX.sym(name, *symbol.shape) for name, symbol in inputs.items()}
-    stage = stage_parameter_gradient(problem, blocks, exact=exact)
-    stages = stage.map(problem.horizon)(*_stage_arguments(problem, symbols, exact=exact).values())
-    gradient = rest(*symbols.values())
-    gradient[blocks.slices["p"]] = ca.sum2(stages)
-    return StackedFunction("value_gradient", symbols, {"gradient": gradient})
-
-
-def _policy_jacobian_by_stages(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    inputs: Mapping[str, ca.SX],
-    results: Mapping[str, ca.SX],
-    directions: Sequence[tuple[ca.SX, ca.SX]],
-    *,
-    exact: bool,
-) -> StackedFunction:
-    """The policy's derivatives with that in p, a sum of a function of one stage over the horizon.
-
-    Args:
-        problem: the control problem.
-        blocks: the blocks of θ, p among them.
-        inputs: arguments of the derivatives by name.
-        results: `policy` (n_θ, m), in which the part of p is missing, and `state` (n, m).
-        directions: of each action the adjoint directions of w (n+m, N) and χ (n, N) in the model's
-            units.
-        exact: whether the QP's Hessian is the exact one.
-
-    Returns:
-        The function of the same inputs with all of `policy`.
+        problem: The problem.
+        symbols: θ's symbols (`symbolic_theta`).
+        y: Solution in the model's units: `xi` and `chi` (n, N+1), `v` (m, N), the slack `t` and
+            the rows' multipliers `lam` (n, N).
+        points: Points of linearisation (x, u) in the model's units, (n+m, N).
+        M: Derivatives of the second-order term by the blocks L_k of the exact Hessian, side by
+            side, (n+m, N(n+m)); None where the Hessian is the cost's own.
     """
     horizon = problem.horizon
-    moved = {
-        f"{name}_{action}": direction
-        for action, pair in enumerate(directions)
-        for name, direction in zip(("w", "chi"), pair, strict=True)
-    }
-    rest = stage_function("policy_jacobian_rest", inputs, {**results, **moved})
-    symbols = {name: ca.MX.sym(name, *symbol.shape) for name, symbol in inputs.items()}
-    parts = dict(zip(rest.name_out(), rest(*symbols.values()), strict=True))
-    arguments = _stage_arguments(problem, symbols, exact=exact)
-    stage = _moved_stage_gradient(problem, blocks, exact=exact).map(horizon)
-    policy = parts["policy"]
-    for action in range(problem.n_actions):
-        along = [parts[f"w_{action}"], parts[f"chi_{action}"]]
+    gamma = problem.discount
+    xi = ca.horzsplit(y["xi"])
+    chi = ca.horzsplit(y["chi"])
+    v = ca.horzsplit(y["v"])
+    t = ca.horzsplit(y["t"])
+    lam = ca.horzsplit(y["lam"])
+    M_k = None if M is None else ca.horzsplit(M, points.size1())
+
+    terms = ca.bilin(symbols["B_lambda"], xi[0]) + ca.dot(symbols["b_lambda"], xi[0])
+    terms += symbols["c_lambda"]
+    for k in range(horizon):
+        w = ca.vertcat(xi[k], v[k])
+        stage = ca.dot(symbols["b_l"], w)
+        if M_k is None:
+            stage += ca.bilin(symbols["B_l"], w)
+        else:
+            # The cost expanded about the point, where B_l enters the lifted block by M too.
+            point = points[:, k] - problem.reference
+            stage += ca.bilin(symbols["B_l"], point, 2 * w - point)
+            stage += 2 * ca.dot(M_k[k], symbols["B_l"])
+        terms += gamma**k * stage + ca.dot(chi[k + 1], symbols["c_f"])
+        terms += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], t[k])
+        terms += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], t[k] ** 2)
+        # λ is negative where a lower limit pushes, positive where an upper one does.
+        terms += ca.dot(ca.fmax(-lam[k], 0), symbols["x_l"])
+        terms -= ca.dot(ca.fmax(lam[k], 0), symbols["x_u"])
+    end = xi[horizon]
+    terminal = ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
+    return terms + gamma**horizon * terminal
+
+
+class _Sensitivities:
+    """Symbols and the Lagrangian's gradient in θ, of which both functions are made.
+
+    The QP's v, lam and matrices are inputs in units of `Problem.scale`, all else is in the model's;
+    `y` are the symbols of a solution in the model's units, in which the Lagrangian is written.
+    """
+
+    def __init__(self, problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> None:
+        n = problem.n_states
+        m = problem.n_actions
+        horizon = problem.horizon
+        self.problem = problem
+        self.blocks = blocks
+        self.exact = exact
+        self.symbols = symbolic_theta(problem, blocks)
+        self.y = {
+            "xi": ca.SX.sym("xi", n, horizon + 1),
+            "v": ca.SX.sym("v", m, horizon),
+            "t": ca.SX.sym("t", n, horizon),
+            "lam": ca.SX.sym("lam", n, horizon),
+            "chi": ca.SX.sym("chi", n, horizon + 1),
+        }
+        self.scaled = {
+            "v": ca.SX.sym("v", m, horizon),
+            "lam": ca.SX.sym("lam", n, horizon),
+        }
+        self.x = ca.SX.sym("x", n, horizon)
+        self.u = ca.SX.sym("u", m, horizon)
+        self.M = ca.SX.sym("M", n + m, horizon * (n + m))
+        self.guess = ca.SX.sym("guess", n, horizon)
+
+        points = ca.vertcat(self.x, self.u)
+        M = self.M if exact else None
+        lagrangian = _theta_lagrangian(problem, self.symbols, self.y, points, M)
+        self.gradient = ca.gradient(lagrangian, self.symbols["theta"])
+        """All of it but the part of p, which is a sum of a function of one stage."""
+
+        solution = {name: self.y[name] for name in SOLUTION_PARTS} | self.scaled
+        self.inputs = {**solution, "x": self.x, "u": self.u, "theta": self.symbols["theta"]}
         if exact:
-            size = problem.n_states + problem.n_actions
-            along.append(ca.reshape(symbols["dM"][:, action], size, horizon * size))
-        policy[blocks.slices["p"], action] = -ca.sum2(stage(*arguments.values(), *along))
-    return StackedFunction("policy_jacobian", symbols, {"policy": policy, "state": parts["state"]})
+            self.inputs |= {"M": self.M, "guess": self.guess}
+
+    def in_scaled_units(self, expression: ca.SX) -> ca.SX:
+        """The expression of v and lam in the model's units as one of the scaled ones."""
+        scale = self.problem.scale
+        horizon = self.problem.horizon
+        v = self.scaled["v"] * ca.repmat(ca.DM(scale.action), 1, horizon)
+        lam = self.scaled["lam"] * ca.repmat(ca.DM(scale.state_price), 1, horizon)
+        return ca.substitute([expression], [self.y["v"], self.y["lam"]], [v, lam])[0]
+
+    def value_gradient(self) -> StackedFunction:
+        """dV/dθ or dQ/dθ: the Lagrangian's gradient at a solution."""
+        results = {"gradient": self.in_scaled_units(self.gradient)}
+        if "p" not in self.blocks:
+            return StackedFunction("value_gradient", self.inputs, results)
+        # A stage's gradient is called: written out for each stage its C takes minutes to compile.
+        rest = stage_function("value_gradient_rest", self.inputs, results)
+        stage = stage_parameter_gradient(self.problem, self.blocks, exact=self.exact)
+        symbols = _call_symbols(self.inputs)
+        arguments = self._stage_arguments(symbols)
+        stages = stage.map(self.problem.horizon)(*arguments)
+        gradient = rest(*symbols.values())
+        gradient[self.blocks.slices["p"]] = ca.sum2(stages)
+        return StackedFunction("value_gradient", symbols, {"gradient": gradient})
+
+    def policy_jacobian(self) -> StackedFunction:
+        """dπ/dθ and dπ/ds, transposed: derivatives of the gradient along the KKT adjoints."""
+        problem = self.problem
+        n = problem.n_states
+        m = problem.n_actions
+        horizon = problem.horizon
+        width = n + m
+        qp = {
+            "A": ca.SX.sym("A", n, n * horizon),
+            "B": ca.SX.sym("B", m, n * horizon),
+            "L": ca.SX.sym("L", width, horizon * width),
+            "L_N": ca.SX.sym("L_N", n, n),
+        }
+        directions = {
+            "dv": ca.SX.sym("dv", m * horizon, m),
+            "dt": ca.SX.sym("dt", n * horizon, m),
+            "dlam": ca.SX.sym("dlam", n * horizon, m),
+        }
+        differentiated = list(self.y.values())
+        if self.exact:
+            directions["dM"] = ca.SX.sym("dM", width * horizon * width, m)
+            differentiated.append(self.M)
+
+        policy = []
+        by_state = []
+        moved: dict[str, ca.SX] = {}
+        for i in range(m):
+            column = {name: direction[:, i] for name, direction in directions.items()}
+            # In the model's units: the right-hand side was one unit of the scaled action's price.
+            unit = float(problem.scale.action[i] / problem.scale.cost)
+            direction = self._direction(qp, column, unit)
+            moved_solution = ca.veccat(*direction.values())
+            derivative = ca.jtimes(self.gradient, ca.veccat(*differentiated), moved_solution)
+            policy.append(-self.in_scaled_units(derivative))
+            by_state.append(-direction["chi"][:, 0])
+            moved[f"w_{i}"] = ca.vertcat(direction["xi"][:, :horizon], direction["v"])
+            moved[f"chi_{i}"] = direction["chi"][:, 1:]
+        inputs = {**self.inputs, **qp, **directions}
+        results = {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)}
+        if "p" not in self.blocks:
+            return StackedFunction("policy_jacobian", inputs, results)
+
+        rest = stage_function("policy_jacobian_rest", inputs, {**results, **moved})
+        stage = self._moved_parameter_gradient().map(horizon)
+        symbols = _call_symbols(inputs)
+        arguments = self._stage_arguments(symbols)
+        parts = dict(zip(rest.name_out(), rest(*symbols.values()), strict=True))
+        for i in range(m):
+            along = [parts[f"w_{i}"], parts[f"chi_{i}"]]
+            if self.exact:
+                along.append(ca.reshape(symbols["dM"][:, i], width, horizon * width))
+            of_stages = stage(*arguments, *along)
+            parts["policy"][self.blocks.slices["p"], i] = -ca.sum2(of_stages)
+        whole = {name: parts[name] for name in ("policy", "state")}
+        return StackedFunction("policy_jacobian", symbols, whole)
+
+    def _stage_arguments(self, symbols: Mapping[str, ca.MX]) -> list[ca.MX]:
+        """Arguments of `stage_parameter_gradient`, those of stage 0, 1, … side by side."""
+        problem = self.problem
+        horizon = problem.horizon
+        v = symbols["v"] * ca.repmat(ca.DM(problem.scale.action), 1, horizon)
+        w = ca.vertcat(symbols["xi"][:, :horizon], v)
+        w += ca.repmat(ca.DM(problem.reference), 1, horizon)
+        theta = ca.repmat(symbols["theta"], 1, horizon)
+        arguments = [symbols["x"], symbols["u"], theta, w, symbols["chi"][:, 1:]]
+        if self.exact:
+            arguments += [symbols["M"], symbols["guess"]]
+        return arguments
+
+    def _moved_parameter_gradient(self) -> ca.Function:
+        """Directional derivative of `stage_parameter_gradient` in w, χ and, if exact, M."""
+        stage = stage_parameter_gradient(self.problem, self.blocks, exact=self.exact)
+        arguments = {
+            name: ca.SX.sym(name, *stage.size_in(i)) for i, name in enumerate(stage.name_in())
+        }
+        names = ("w", "chi", "M") if self.exact else ("w", "chi")
+        along = {f"d{name}": ca.SX.sym(f"d{name}", *arguments[name].shape) for name in names}
+        variables = ca.veccat(*(arguments[name] for name in names))
+        derivative = ca.jtimes(stage(*arguments.values()), variables, ca.veccat(*along.values()))
+        inputs = {**arguments, **along}
+        return stage_function("moved_parameter_gradient", inputs, {"derivative": derivative})
+
+    def _direction(
+        self, qp: Mapping[str, ca.SX], column: Mapping[str, ca.SX], unit: float
+    ) -> dict[str, ca.SX]:
+        """An adjoint direction of the whole solution in the model's units, by its parts.
+
+        `column` has its parts of v, t, lam and, with the exact Hessian, M; those of the states and
+        costates follow from the dynamics and the adjoint recursion.
+        """
+        problem = self.problem
+        n = problem.n_states
+        m = problem.n_actions
+        horizon = problem.horizon
+        A = ca.horzsplit(qp["A"], n)
+        B = ca.horzsplit(qp["B"], n)
+        L = ca.horzsplit(qp["L"], n + m)
+        v = ca.reshape(column["dv"], m, horizon)
+        t = ca.reshape(column["dt"], n, horizon)
+        lam = ca.reshape(column["dlam"], n, horizon)
+
+        xi = [ca.SX(n, 1)]
+        for k in range(horizon):
+            xi.append(A[k].T @ xi[k] + B[k].T @ v[:, k])
+        chi = [qp["L_N"] @ xi[horizon] + lam[:, horizon - 1]]
+        for k in reversed(range(horizon)):
+            costate = L[k][:n, :] @ ca.vertcat(xi[k], v[:, k]) + A[k] @ chi[0]
+            chi.insert(0, costate + (lam[:, k - 1] if k else 0))
+
+        state = ca.DM(problem.scale.state)
+        action = ca.DM(problem.scale.action)
+        price = ca.DM(problem.scale.state_price)
+        direction = {
+            "xi": ca.horzcat(*(part * state * unit for part in xi)),
+            "v": v * ca.repmat(action * unit, 1, horizon),
+            "t": t * ca.repmat(state * unit, 1, horizon),
+            "lam": lam * ca.repmat(price * unit, 1, horizon),
+            "chi": ca.horzcat(*(part * price * unit for part in chi)),
+        }
+        if self.exact:
+            direction["M"] = column["dM"]
+        return direction
 
 
-def _moved_stage_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> ca.Function:
-    """Directional derivative of `stage_parameter_gradient` in w, χ and, with `exact`, M."""
-    stage = stage_parameter_gradient(problem, blocks, exact=exact)
-    names = ("w", "chi", "M") if exact else ("w", "chi")
-    arguments = {name: ca.SX.sym(name, *stage.size_in(i)) for i, name in enumerate(stage.name_in())}
-    along = {f"moved_{name}": ca.SX.sym(f"moved_{name}", *arguments[name].shape) for name in names}
-    variables = ca.veccat(*(arguments[name] for name in names))
-    derivative = ca.jtimes(stage(*arguments.values()), variables, ca.veccat(*along.values()))
-    return stage_function(
-        "moved_parameter_gradient", {**arguments, **along}, {"moved_gradient": derivative}
-    )
+def _call_symbols(inputs: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
+    """Symbols of the same names and shapes for a graph of calls."""
+    return {name: ca.MX.sym(name, *symbol.shape) for name, symbol in inputs.items()}
 
 
-def sensitivities(  # noqa: PLR0915
+def sensitivities(
     problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
     """Gradient of the value in θ, and a maker of its derivatives along the KKT adjoints.
 
-    The first maps a solution (xi, v, t, lam, chi), the linearisation points x, u and theta to
-    `gradient` (n_θ). The second takes the longest to make and few ask for it. It maps that, the
-    QP's A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam (nN, m). Its
-    results are `policy` (n_θ, m), dπ/dθ transposed, and `state` (n, m), dπ/ds transposed. With
-    `exact` both need M (see `_theta_part`) and χ̄, the costates where the curvature was taken, the
-    second also dM, the directional derivative of M. v, lam, the QP's matrices and the directions
-    are in units of `Problem.scale`, all else in the model's.
+    v, lam, the QP's matrices and the directions are in units of `Problem.scale`, all else in the
+    model's (paper.tex, RTI Sensitivities).
+
+    Args:
+        problem: The problem with its model and scale.
+        blocks: The blocks of θ.
+        exact: Whether the QP's Hessian holds the curvature of the model. Both functions then need
+            M (see `_theta_lagrangian`) and χ̄, the costates where the curvature was taken, the
+            second also dM, the directional derivative of M.
+
+    Returns:
+        A function of a solution (xi, v, t, lam, chi), the linearisation points x, u and theta,
+        whose result is `gradient` (n_θ,). And what makes a second function, on its first call
+        since it takes the longest to make and few ask for it. That is one of the same, the QP's
+        A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam (nN, m); its
+        results are `policy` (n_θ, m), dπ/dθ transposed, and `state` (n, m), dπ/ds transposed.
     """
-    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    scale = problem.scale
-    state, action = ca.DM(scale.state), ca.DM(scale.action)
-    price = ca.DM(scale.state_price)
-    symbols = symbolic_theta(problem, blocks)
-    columns = {"xi": horizon + 1, "v": horizon, "t": horizon, "lam": horizon, "chi": horizon + 1}
-    y = {name: ca.SX.sym(name, m if name == "v" else n, c) for name, c in columns.items()}
-    x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
-    M = ca.SX.sym("M", n + m, horizon * (n + m))
-    guess = ca.SX.sym("guess", n, horizon)
-    extra = {"M": M, "guess": guess} if exact else {}
-    scaled = {name: ca.SX.sym(name, *y[name].shape) for name in ("v", "lam")}
-    units = ca.repmat(action, 1, horizon), ca.repmat(price, 1, horizon)
-    in_model_units = [scaled["v"] * units[0], scaled["lam"] * units[1]]
-    part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
-    gradient = ca.gradient(part, symbols["theta"])
-    solution = {name: y[name] for name in SOLUTION} | scaled
-    inputs = {**solution, "x": x, "u": u, "theta": symbols["theta"], **extra}
-
-    def of_scaled(expression: ca.SX) -> ca.SX:
-        """The expression of v and lam in the model's units as one of the scaled ones."""
-        return ca.substitute([expression], [y["v"], y["lam"]], in_model_units)[0]
-
-    results = {"gradient": of_scaled(gradient)}
-    if "p" in blocks:
-        # A stage's gradient is a call: written out for each stage, its C takes minutes to compile.
-        value = _value_gradient_by_stages(problem, blocks, inputs, results, exact=exact)
-    else:
-        value = StackedFunction("value_gradient", inputs, results)
-
-    @cache
-    def policy_jacobian() -> StackedFunction:
-        A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
-        L, L_N = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("L_N", n, n)
-        dv, dt, dlam = (
-            ca.SX.sym(name, rows * horizon, m) for name, rows in (("dv", m), ("dt", n), ("dlam", n))
-        )
-        dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
-        symbol = ca.veccat(*y.values(), *([M] if exact else []))
-        policy, by_state, moved_stages = [], [], []
-        for i in range(m):
-            v_i = ca.reshape(dv[:, i], m, horizon)
-            lam_i = ca.reshape(dlam[:, i], n, horizon)
-            # The directions of the states and costates that go with them.
-            xi_i = [ca.SX(n, 1)]
-            for k in range(horizon):
-                stage = slice(k * n, (k + 1) * n)
-                xi_i.append(A[:, stage].T @ xi_i[k] + B[:, stage].T @ v_i[:, k])
-            chi_i = [L_N @ xi_i[horizon] + lam_i[:, horizon - 1]]
-            for k in reversed(range(horizon)):
-                weight = L[:, k * (n + m) : (k + 1) * (n + m)]
-                costate = weight[:n, :] @ ca.vertcat(xi_i[k], v_i[:, k])
-                costate += A[:, k * n : (k + 1) * n] @ chi_i[0]
-                chi_i.insert(0, costate + (lam_i[:, k - 1] if k else 0))
-            # In the model's units: the right-hand side was one unit of the scaled action's price.
-            unit = float(scale.action[i] / scale.cost)
-            curved = [dM[:, i]] if exact else []
-            direction = ca.veccat(
-                *(part * state * unit for part in xi_i),
-                v_i * ca.repmat(action * unit, 1, horizon),
-                ca.reshape(dt[:, i], n, horizon) * ca.repmat(state * unit, 1, horizon),
-                lam_i * ca.repmat(price * unit, 1, horizon),
-                *(part * price * unit for part in chi_i),
-                *curved,
-            )
-            policy.append(-of_scaled(ca.jtimes(gradient, symbol, direction)))
-            by_state.append(-chi_i[0] * price * unit)
-            moved_w = ca.vertcat(ca.horzcat(*xi_i[:-1]), v_i) * ca.repmat(
-                ca.DM(scale.both) * unit, 1, horizon
-            )
-            moved_chi = ca.horzcat(*chi_i[1:]) * ca.repmat(price * unit, 1, horizon)
-            moved_stages.append((moved_w, moved_chi))
-        moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
-        arguments = {**inputs, **moved, **({"dM": dM} if exact else {})}
-        results = {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)}
-        if "p" in blocks:
-            return _policy_jacobian_by_stages(
-                problem, blocks, arguments, results, moved_stages, exact=exact
-            )
-        return StackedFunction("policy_jacobian", arguments, results)
-
-    return value, policy_jacobian
+    made = _Sensitivities(problem, blocks, exact=exact)
+    return made.value_gradient(), cache(made.policy_jacobian)
 
 
 def adjoint_directions(
@@ -262,14 +301,25 @@ def adjoint_directions(
 
     The KKT matrix of the active set is symmetric, so these rows of its inverse are all that dπ/dθ
     and dπ/ds need.
+
+    Args:
+        qp: The condensed QP with mN variables and nN rows.
+        solution: Its solution.
+        n_actions: Number of actions m.
+
+    Returns:
+        dv (m, mN), dt (m, nN) and dλ (m, nN).
     """
-    active, seeds = solution.active(qp), np.eye(n_actions, qp.f.size)
+    active = solution.active(qp)
+    seeds = np.eye(n_actions, qp.f.size)
     dv, dlam = kkt_solve(qp, active, seeds, np.zeros((n_actions, qp.w.size)))
-    violated, dt = active[2], np.zeros_like(dlam)
+    dt = np.zeros_like(dlam)
+    violated = active.violated
     if violated.any():
-        moved = (dv @ qp.rows.T)[:, violated]
-        dlam[:, violated] = 2 * qp.W[violated] * moved
-        dt[:, violated] = np.sign(solution.lam[violated]) * moved
+        # The slack of a violated row moves with the row, and λ = ±(w + 2Wt) with the slack.
+        row_change = (dv @ qp.rows.T)[:, violated]
+        dlam[:, violated] = 2 * qp.W[violated] * row_change
+        dt[:, violated] = np.sign(solution.lam[violated]) * row_change
     return dv, dt, dlam
 
 
@@ -282,17 +332,25 @@ def curvature_directions(
 ) -> Matrix:
     """Directional derivatives of M along the adjoint directions, (m, N(n+m)²).
 
-    `rows` are those of the QP, `step` (N, n+m) is Δw of each stage in the model's units, `contract`
-    the Hessian's spectrum's, `scale` that of the QP.
+    M is the contraction of ½ΔwΔwᵀ, so its derivative that of the symmetric part of Δw dwᵀ.
+
+    Args:
+        rows: Rows Γ of the QP, (nN, mN).
+        dv: Adjoint directions, (m, mN).
+        step: Δw of each stage from its point of linearisation in the model's units, (N, n+m).
+        contract: Adjoint of the lift's derivative (`Spectrum.contract`).
+        scale: Scale of the QP.
     """
     horizon, width = step.shape
     n = rows.shape[0] // horizon
     result = []
     for unit, row in zip(scale.action / scale.cost, dv, strict=True):
-        moved = np.zeros((horizon, width))
-        moved[1:, :n] = (rows @ row).reshape(horizon, n)[:-1]
-        moved[:, n:] = row.reshape(horizon, width - n)
-        moved *= scale.both * unit
-        seed = (step[:, :, None] * moved[:, None, :] + moved[:, :, None] * step[:, None, :]) / 2
-        result.append(contract(seed).reshape(-1))
+        direction = np.zeros((horizon, width))
+        # The rows are x_1 … x_N; x_0 is given and does not move, x_N is in no stage.
+        direction[1:, :n] = (rows @ row).reshape(horizon, n)[:-1]
+        direction[:, n:] = row.reshape(horizon, width - n)
+        direction *= scale.both * unit
+        outer = step[:, :, None] * direction[:, None, :]
+        transposed = direction[:, :, None] * step[:, None, :]
+        result.append(contract((outer + transposed) / 2).reshape(-1))
     return np.array(result)

@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from itertools import product
 from pathlib import Path
 from string import Template
 
@@ -16,14 +15,16 @@ from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
 from controllers.functions import c_source, not_in_c, work_sizes
-from controllers.preparation import RESIDUAL, Exact, SampleFunctions
+from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.scenario import Scenario
 
 SOURCES = Path(__file__).parent / "sources"
 QP_SOURCES = ("qp.h", "qp_enter.h", "qp_refine.h", "qp_residual.h", "qp_set.h")
-SOLVERS = ("condensed.h", *QP_SOURCES), ("stages.h", "qp_set.h")
+# The files of each solver of a sample's QP; the first is what `rti.h` includes.
+CONDENSED_SOLVER = ("condensed.h", *QP_SOURCES)
+STAGEWISE_SOLVER = ("stages.h", "qp_set.h")
 # A sample's arrays live on the stack, of which a thread has 1 MB on some platforms.
 STACK_LIMIT = 400_000
 STATUSES = (
@@ -53,88 +54,144 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     """Write the C of an RTI-NMPC: deterministic, without allocation, C99.
 
     It computes as `RtiNmpc` does with the backend `daqp`, by a QP solver of its own; the
-    parameters θ stay an input. Raises ControllerError where `hessian` is not `gauss-newton` or
-    `exact`, the horizon is too long for a thread's stack, or the model calls what cannot be C.
+    parameters θ stay an input.
+
+    Args:
+        problem: The control problem.
+        parameters: θ at the start.
+        hessian: `gauss-newton` or `exact`.
+
+    Raises:
+        ControllerError: Another `hessian`, a horizon too long for a thread's stack, or a model that
+            calls what cannot be C.
     """
     parameters.require_well_posed()
-    made = SampleFunctions(problem, parameters.blocks, hessian)
-    if (reason := why_not_in_c(made)) is not None:
+    functions = SampleFunctions(problem, parameters.blocks, hessian)
+    reason = why_not_in_c(functions)
+    if reason is not None:
         raise ControllerError(
             f"a controller with the model '{problem.model.name}' cannot be exported: {reason}; "
             "write it as expressions or as a table (casadi.interpolant)"
         )
-    if (size := stack_needed(made)) > STACK_LIMIT:
+    size = stack_needed(functions)
+    if size > STACK_LIMIT:
         raise ControllerError(
             f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "
             f"than the {STACK_LIMIT / 1e3:.0f} kB that an exported controller may take; shorten it"
         )
-    return Core(problem, parameters, controller_sources(made))
+    return Core(problem, parameters, controller_sources(functions))
 
 
-def controller_sources(made: SampleFunctions, *, stagewise: bool = False) -> dict[str, bytes]:
-    """C files by name of a controller; its QP is condensed, or solved stage by stage."""
-    wanted = ("core.h", "rti.h", *SOLVERS[stagewise], "costs.h", "rotation.h", made.hessian.source)
-    sources = {name: (SOURCES / name).read_bytes() for name in wanted}
+def controller_sources(functions: SampleFunctions, *, stagewise: bool = False) -> dict[str, bytes]:
+    """C files of a controller.
+
+    Args:
+        functions: Its CasADi functions; those of `named` are in C.
+        stagewise: Whether the QP is solved stage by stage; condensed else.
+
+    Returns:
+        Contents by file name, the same bytes for the same functions.
+    """
+    solver_files = STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER
+    names = ["core.h", "rti.h", *solver_files, "costs.h", "rotation.h", functions.hessian.source]
+    sources = {name: (SOURCES / name).read_bytes() for name in names}
+    # The preparation's graph maps the stage's function and is written by hand; stage by stage
+    # nothing is condensed, so that no condensed vectors are embedded.
     unused = {"PREPARED", "EMBEDDED"} if stagewise else {"PREPARED"}
-    called = [each.function for name, each in made.named.items() if name not in unused]
-    sources["linearise.h"] = _functions("linearise", [made.stage])
+    called = []
+    for prefix, part in functions.named.items():
+        if prefix not in unused:
+            called.append(part.function)
+    sources["linearise.h"] = _functions("linearise", [functions.stage])
     sources["functions.h"] = _functions("functions", called)
-    sources["problem.h"] = _constants(made, stagewise).encode()
+    sources["problem.h"] = _constants(functions, stagewise).encode()
     return sources
 
 
-def why_not_in_c(made: SampleFunctions) -> str | None:
+def why_not_in_c(functions: SampleFunctions) -> str | None:
     """What of a controller's model keeps it from being C (`not_in_c`); None where nothing does."""
-    return not_in_c(_written(made))
+    return not_in_c(_written(functions))
 
 
-def _written(made: SampleFunctions) -> list[ca.Function]:
+def _written(functions: SampleFunctions) -> list[ca.Function]:
     """The functions that become C; the preparation's graph maps `stage` and is done by hand."""
-    return [made.stage, *(part.function for name, part in made.named.items() if name != "PREPARED")]
+    written = [functions.stage]
+    for prefix, part in functions.named.items():
+        if prefix != "PREPARED":
+            written.append(part.function)
+    return written
 
 
-def stack_needed(made: SampleFunctions) -> int:
+def stack_needed(functions: SampleFunctions) -> int:
     """Upper bound of a sample's stack in bytes.
 
     CasADi's work vectors and the QP solver's arrays share their place; gcc and clang add 4 to 18 %
     and up to 4 kB.
     """
-    problem = made.problem
-    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    variables, limits = horizon * m, horizon * (m + n)
-    own = made.preparation.memory.size + made.readout.memory.size
+    problem = functions.problem
+    n = problem.n_states
+    m = problem.n_actions
+    horizon = problem.horizon
+    variables = horizon * m
+    limits = horizon * (m + n)
+    # Numbers in `RtiPrepared` and `RtiSolved`, in `QpWork` with the factorisation's arrays, and in
+    # the responses of condensing.
+    sample = functions.preparation.memory.size + functions.readout.memory.size
     solver = limits * (variables + limits + 10) + 2 * limits + variables * (variables + 1)
     condensing = (horizon + 5) * n * (variables + n + 1)
-    work = [sum(work_sizes("", function).values()) for function in _written(made)]
+    work = [sum(work_sizes("", function).values()) for function in _written(functions)]
     shared = max(solver, condensing, *work)
-    return 4000 + round(1.2 * 8 * (own + shared))
+    return 4000 + round(1.2 * 8 * (sample + shared))
 
 
 def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
     """CasADi's C with every function static and without the compiler's remarks on it."""
     helper = re.compile(r"^(?:const )?(?:casadi_real|casadi_int|void|int)\*? casadi_", re.MULTILINE)
     code = c_source(functions, name)
-    code = helper.sub(lambda found: f"static {found.group()}", code)
+    code = helper.sub(lambda match: f"static {match.group()}", code)
     return _filled("functions.h.in", code=code).encode()
 
 
-def _constants(made: SampleFunctions, stagewise: bool) -> str:
-    problem, blocks = made.problem, made.blocks
-    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    sizes = {"N_X": n, "N_U": m, "N_W": n + m, "HORIZON": horizon, "N_THETA": blocks.size}
-    for prefix, call in made.named.items():
-        sizes |= {f"{prefix}_{name}": part.start for name, part in call.slices.items()}
+def _constants(functions: SampleFunctions, stagewise: bool) -> str:
+    """Text of `problem.h`: sizes, the constants of problem and scale, and which files are used."""
+    problem = functions.problem
+    blocks = functions.blocks
+    n = problem.n_states
+    m = problem.n_actions
+    sizes = {
+        "N_X": n,
+        "N_U": m,
+        "N_W": n + m,
+        "HORIZON": problem.horizon,
+        "N_THETA": blocks.size,
+    }
+    for prefix, call in functions.named.items():
+        for name, place in call.slices.items():
+            sizes[f"{prefix}_{name}"] = place.start
         sizes[f"{prefix}_SIZE"] = call.stack.size
         sizes |= work_sizes(prefix, call.function)
-    sizes |= work_sizes("LINEARISE", made.stage)
-    sizes |= {f"THETA_{name}": part.start for name, part in blocks.slices.items()}
-    vectors = ["reference_state", "reference_action", "action_lower", "action_upper"]
-    slack = {"linear": "((theta) + THETA_w_sigma)", "quadratic": "((theta) + THETA_W_sigma)"}
-    if "w_sigma" not in blocks:
-        vectors += ["penalty_linear", "penalty_quadratic"]
-        slack = {kind: f"((void)(theta), PENALTY_{kind.upper()})" for kind in slack}
-    arrays = {name.upper(): getattr(problem, name) for name in vectors}
-    scale, rule = problem.scale, made.hessian
+    sizes |= work_sizes("LINEARISE", functions.stage)
+    for name, place in blocks.slices.items():
+        sizes[f"THETA_{name}"] = place.start
+
+    arrays = {
+        "REFERENCE_STATE": problem.reference_state,
+        "REFERENCE_ACTION": problem.reference_action,
+        "ACTION_LOWER": problem.action_lower,
+        "ACTION_UPPER": problem.action_upper,
+    }
+    # Slack weights are read from θ, or else are constants.
+    if "w_sigma" in blocks:
+        slack = {"linear": "((theta) + THETA_w_sigma)", "quadratic": "((theta) + THETA_W_sigma)"}
+    else:
+        arrays["PENALTY_LINEAR"] = problem.penalty_linear
+        arrays["PENALTY_QUADRATIC"] = problem.penalty_quadratic
+        slack = {
+            "linear": "((void)(theta), PENALTY_LINEAR)",
+            "quadratic": "((void)(theta), PENALTY_QUADRATIC)",
+        }
+    scale = problem.scale
+    rule = functions.hessian
     arrays |= {
         "SCALE_STATE": scale.state,
         "SCALE_ACTION": scale.action,
@@ -152,10 +209,10 @@ def _constants(made: SampleFunctions, stagewise: bool) -> str:
         arrays="\n".join(_array(name, values) for name, values in arrays.items()),
         end_discount=repr(float(problem.discounts[-1])),
         floor=repr(Exact.FLOOR),
-        residual=repr(RESIDUAL),
+        residual=repr(SOLVED_RESIDUAL),
         cost_scale=repr(problem.scale.cost),
-        rule=made.hessian.source,
-        solver=SOLVERS[stagewise][0],
+        rule=rule.source,
+        solver=(STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER)[0],
         stagewise=str(int(stagewise)),
         **slack,
     )
@@ -171,10 +228,13 @@ def _array(name: str, values: ArrayLike) -> str:
 
 
 def _number(value: float) -> str:
-    return repr(float(value)) if np.isfinite(value) else "INFINITY" if value > 0 else "-INFINITY"
+    if np.isfinite(value):
+        return repr(float(value))
+    return "INFINITY" if value > 0 else "-INFINITY"
 
 
 TEMPLATES = Path(__file__).parent / "plain"
+
 _INCLUDE = re.compile(r'^[ \t]*#include "(?P<name>[\w.]+)"[ \t]*\n', re.MULTILINE)
 _C_NAME = re.compile(r"[A-Za-z]\w*")
 
@@ -194,17 +254,29 @@ _SINGLE = (
 def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) -> dict[str, str]:
     """Text of ``NAME.c``, ``NAME.h``, ``main.c`` and ``CMakeLists.txt`` by file name.
 
-    `single` has `float` in the place of `double`. Raises ControllerError where `name`, with which
-    the functions begin, is no C name.
+    Args:
+        core: The controller in C.
+        name: What the functions' names begin with.
+        scenario: The scenario that it was made for.
+        single: Whether to have `float` in the place of `double`.
+
+    Raises:
+        ControllerError: `name` is no C name.
     """
     if not _C_NAME.fullmatch(name):
         raise ControllerError(f"'{name}' is no name for C: letters, digits and _ only")
     problem = core.problem
-    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+    n = problem.n_states
+    m = problem.n_actions
+    horizon = problem.horizon
+    # Numbers in `CoreGuess` and `CoreSolution`, and with these in `CoreState`.
     guess = horizon * (2 * n + m)
     solution = (horizon + 1) * n + horizon * m + guess + 3
-    words = [re.sub(r"\W", "_", text.replace("θ", "theta")).upper() for text in STATUSES]
     upper = name.upper()
+    statuses = []
+    for k, text in enumerate(STATUSES):
+        word = re.sub(r"\W", "_", text.replace("θ", "theta")).upper()
+        statuses.append(f"    {upper}_{word} = {k}")
     values = {
         "name": name,
         "Name": "".join(part.capitalize() for part in name.split("_")),
@@ -218,7 +290,7 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
         "actions": ", ".join(scenario.plant.actions),
         "parameters": core.parameters.blocks.size,
         "memory": guess + solution + 2 * m + 2,
-        "statuses": ",\n".join(f"    {upper}_{word} = {k}" for k, word in enumerate(words)),
+        "statuses": ",\n".join(statuses),
         "theta": ", ".join(repr(value) for value in core.parameters.theta.tolist()),
         "core": _joined(core),
     }
@@ -226,8 +298,9 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
     files = {}
     for path in sorted(TEMPLATES.iterdir()):
         text = Template(path.read_text(encoding="utf-8")).substitute(values)
-        for pattern, by in _SINGLE if single and path.suffix in (".c", ".h") else ():
-            text = pattern.sub(by, text)
+        if single and path.suffix in (".c", ".h"):
+            for pattern, replacement in _SINGLE:
+                text = pattern.sub(replacement, text)
         files[names.get(path.name, path.name)] = text
     return files
 
@@ -236,12 +309,14 @@ def _joined(core: Core) -> str:
     """`core.h` with each file that it includes in the place of its first inclusion."""
     files = {name: data.decode() for name, data in core.sources.items()}
     chosen = re.findall(r'#define (\w+_RULE) "([\w.]+)"', files["problem.h"])
-    for (macro, name), text in product(chosen, list(files)):
-        files[text] = files[text].replace(f"#include {macro}", f'#include "{name}"')
+    for macro, chosen_name in chosen:
+        for name, text in files.items():
+            files[name] = text.replace(f"#include {macro}", f'#include "{chosen_name}"')
     seen: set[str] = set()
 
-    def replace(found: re.Match[str]) -> str:
-        if (name := found["name"]) in seen:
+    def replace(match: re.Match[str]) -> str:
+        name = match["name"]
+        if name in seen:
             return ""
         seen.add(name)
         return _INCLUDE.sub(replace, files[name])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -23,7 +23,7 @@ from controllers.export.core import (
     why_not_in_c,
 )
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
-from controllers.preparation import RESIDUAL, Exact, SampleFunctions, Spectrum
+from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions, Spectrum
 from controllers.problem import Problem
 from controllers.qp import (
     QpBackend,
@@ -34,7 +34,7 @@ from controllers.qp import (
     polish,
 )
 from controllers.sensitivities import (
-    SOLUTION,
+    SOLUTION_PARTS,
     adjoint_directions,
     curvature_directions,
     sensitivities,
@@ -56,7 +56,7 @@ class LinearisationPoint(NamedTuple):
     costates: Matrix
 
 
-class Functions(SampleFunctions):
+class NmpcFunctions(SampleFunctions):
     """The CasADi functions of a controller: a sample's, and its derivatives in θ."""
 
     @cached_property
@@ -72,14 +72,22 @@ class Functions(SampleFunctions):
         return super().named | {"GRADIENT": gradient, "POLICY": make_policy()}
 
     def condense(self, before: Vector, after: Vector) -> None:
-        """Write the condensed QP into copies of both memories."""
-        own = self.preparation.memory, self.readout.memory
-        kept = [memory.copy() for memory in own]
-        own[0][:], own[1][:] = before, after
+        """Write the condensed QP into copies of both memories.
+
+        Args:
+            before: Copy of the preparation's memory, whose inputs are a point and θ.
+            after: Copy of the read-out's memory, which has the state.
+        """
+        prepared = self.preparation.memory
+        read = self.readout.memory
+        saved = prepared.copy(), read.copy()
+        prepared[:] = before
+        read[:] = after
         self.preparation()
         self.embedding()
-        before[:], after[:] = own
-        own[0][:], own[1][:] = kept
+        before[:] = prepared
+        after[:] = read
+        prepared[:], read[:] = saved
 
 
 @dataclass(eq=False)
@@ -93,7 +101,7 @@ class Prepared:
 
     memory: Vector
     spectrum: Spectrum | None
-    functions: Functions
+    functions: NmpcFunctions
     engine: Engine | None = None
 
     def part(self, name: str) -> Vector:
@@ -104,8 +112,11 @@ class Prepared:
     def point(self) -> LinearisationPoint:
         """Where the QP is linearised."""
         horizon = self.functions.problem.horizon
-        parts = (self.part(name) for name in LinearisationPoint._fields)
-        return LinearisationPoint(*(part.reshape(horizon, -1).copy() for part in parts))
+        return LinearisationPoint(
+            x=self.part("x").reshape(horizon, -1).copy(),
+            u=self.part("u").reshape(horizon, -1).copy(),
+            costates=self.part("costates").reshape(horizon, -1).copy(),
+        )
 
     def contract(self, seed: Vector) -> Vector:
         """Adjoint of the lift's derivative (`Spectrum.contract`), of the identity without one."""
@@ -138,12 +149,13 @@ class RtiSolution:
     @cached_property
     def multipliers(self) -> QpSolution:
         """Primal-dual solution of the condensed QP, in units of `Problem.scale`."""
-        return QpSolution(*(self._part(name) for name in ("v", "nu", "lam")))
+        return QpSolution(self._part("v"), self._part("nu"), self._part("lam"))
 
     @cached_property
     def qp(self) -> SoftQp:
         """The condensed QP that was solved, in units of `Problem.scale`."""
-        functions, prepared = self.prepared.functions, self.prepared
+        prepared = self.prepared
+        functions = prepared.functions
         if prepared.engine is not None and prepared.engine.stagewise:
             functions.condense(prepared.memory, self.memory)
         return functions.qp(prepared.memory, self.memory)
@@ -157,14 +169,16 @@ class RtiSolution:
     def predicted_actions(self) -> Matrix:
         """Predicted actions u_0 … u_{N−1}, shape (N, m)."""
         problem = self.prepared.functions.problem
-        moved = self.multipliers.v.reshape(-1, problem.n_actions) * problem.scale.action
-        return np.asarray(moved + problem.reference_action)
+        deviation = self.multipliers.v.reshape(-1, problem.n_actions) * problem.scale.action
+        return np.asarray(deviation + problem.reference_action)
 
     @property
     def unshifted(self) -> LinearisationPoint:
         """The solution, not shifted, as a point of linearisation for the same sample."""
         return LinearisationPoint(
-            self.predicted_states[:-1], self.predicted_actions, self.costates[1:]
+            x=self.predicted_states[:-1],
+            u=self.predicted_actions,
+            costates=self.costates[1:],
         )
 
     @property
@@ -241,29 +255,40 @@ class RtiSolution:
                 "the action was enforced, so this solution is Q(s, a) and has no policy; "
                 "call feedback(s) without an action"
             )
-        m, prepared = self.action.size, self.prepared
+        m = self.action.size
+        prepared = self.prepared
         if prepared.engine is not None:
-            found = prepared.engine.policy(prepared.memory, self.memory)
-            if found is not None:
-                return found
+            jacobians = prepared.engine.policy(prepared.memory, self.memory)
+            if jacobians is not None:
+                return jacobians
+
+        # By Python, which solves the KKT system by least squares where LICQ fails.
         dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
-        function = prepared.functions.derivatives[1]()
+        _, make_function = prepared.functions.derivatives
+        function = make_function()
         self._write_solution(function)
-        inputs = function.inputs
-        for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
-            inputs[name][:] = direction.reshape(-1)
-        if "dM" in inputs:
-            step = self._step_from_point()
-            scale = prepared.functions.problem.scale
-            moved = curvature_directions(self.qp.rows, dv, step, prepared.contract, scale)
-            inputs["dM"][:] = moved.reshape(-1)
+        function.inputs["dv"][:] = dv.reshape(-1)
+        function.inputs["dt"][:] = dt.reshape(-1)
+        function.inputs["dlam"][:] = dlam.reshape(-1)
+        if "dM" in function.inputs:
+            dM = curvature_directions(
+                self.qp.rows,
+                dv,
+                self._step_from_point(),
+                prepared.contract,
+                prepared.functions.problem.scale,
+            )
+            function.inputs["dM"][:] = dM.reshape(-1)
         function()
-        by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))
+        by_theta = function.part("policy").reshape(m, -1)
+        by_state = function.part("state").reshape(m, -1)
         return by_theta.copy(), by_state.copy()
 
     def _write_solution(self, function: StackedFunction) -> None:
-        inputs, prepared = function.inputs, self.prepared
-        for name in SOLUTION:
+        """Write this solution and its QP into the inputs of a function of `sensitivities`."""
+        inputs = function.inputs
+        prepared = self.prepared
+        for name in SOLUTION_PARTS:
             inputs[name][:] = self._part(name)
         for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
@@ -276,128 +301,271 @@ class RtiSolution:
     def _step_from_point(self) -> Matrix:
         """Δw of each stage, shape (N, n+m)."""
         point = self.prepared.point
-        return np.concatenate(
-            [self.predicted_states[:-1] - point.x, self.predicted_actions - point.u], axis=1
+        states = self.predicted_states[:-1] - point.x
+        actions = self.predicted_actions - point.u
+        return np.concatenate([states, actions], axis=1)
+
+
+class BatchSolution(NamedTuple):
+    """Solutions of K QPs, a row each; π and V of a row are NaN where its QP is not solved.
+
+    `action` (K, m) is π, or the action that was enforced; `value` (K,) is V, or Q. Derivatives are
+    None where they were not asked for, and zero where a row has none: `state_gradient` (K, n) is
+    dV/ds, `value_gradient` (K, n_θ) dV/dθ, `action_gradient` (K, m) dQ/da, `policy_jacobian`
+    (K, m, n_θ) dπ/dθ and `policy_state_jacobian` (K, m, n) dπ/ds.
+    """
+
+    action: Vector
+    value: Vector
+    state_gradient: Vector | None = None
+    value_gradient: Vector | None = None
+    action_gradient: Vector | None = None
+    policy_jacobian: Vector | None = None
+    policy_state_jacobian: Vector | None = None
+
+
+class _Batch:
+    """The arrays of a batch of K QPs: what is given, and what C and Python write row by row.
+
+    Shapes are `states` (K, n), `enforced` (K, m) or None, `theta` (K, n_θ), `points` of
+    linearisation with K rows, `actions` (K, m) and `values` (K,). `slopes` has a row's derivatives
+    side by side, as `engine_batch` writes them; None where they are not asked for.
+    """
+
+    def __init__(
+        self,
+        states: Vector,
+        enforced: Vector | None,
+        theta: Vector,
+        points: LinearisationPoint,
+        *,
+        derivatives: bool,
+    ) -> None:
+        count, n = states.shape
+        m = points.u.shape[-1]
+        size = theta.shape[-1]
+        self.states = states
+        self.enforced = enforced
+        self.theta = theta
+        self.points = points
+        self.actions = np.full((count, m), np.nan)
+        self.values = np.full(count, np.nan)
+        self.slopes: Vector | None = None
+        if derivatives:
+            self.slopes = np.zeros((count, n + size + m + m * (size + n)))
+
+    def point(self, k: int) -> LinearisationPoint:
+        """The point of linearisation of row k."""
+        x, u, costates = self.points
+        return LinearisationPoint(x[k], u[k], costates[k])
+
+    def write(self, k: int, solution: RtiSolution) -> None:
+        """Write a solution into row k."""
+        self.actions[k] = solution.action
+        self.values[k] = solution.value
+        if self.slopes is None:
+            return
+        parts = [solution.costates[0], solution.value_gradient, solution.action_gradient]
+        if not solution.enforced:
+            parts += [solution.policy_jacobian.ravel(), solution.policy_state_jacobian.ravel()]
+        row = np.concatenate(parts)
+        self.slopes[k, : row.size] = row
+
+    def solution(self) -> BatchSolution:
+        """The batch as it is returned to the user."""
+        if self.slopes is None:
+            return BatchSolution(self.actions, self.values)
+        n = self.states.shape[1]
+        m = self.actions.shape[1]
+        size = self.theta.shape[1]
+        ends = np.cumsum([n, size, m, m * size])
+        by_state, by_theta, by_action, policy_theta, policy_state = np.split(
+            self.slopes, ends, axis=1
+        )
+        return BatchSolution(
+            action=self.actions,
+            value=self.values,
+            state_gradient=by_state,
+            value_gradient=by_theta,
+            action_gradient=by_action,
+            policy_jacobian=policy_theta.reshape(-1, m, size),
+            policy_state_jacobian=policy_state.reshape(-1, m, n),
         )
 
 
 NOT_FINITE = STATUSES.index("not finite")
 INACCURATE = "inaccurate"
 """Status of the QpError of a QP whose solution is not accurate enough to be used."""
-ACCURATE = 1e-9
+ACCURATE_RESIDUAL = 1e-9
 """KKT residual above which a solution is polished."""
 
 
 class Engine:
     """Prepares and solves in the memory of a controller's `functions`; `compile` makes one.
 
-    `prepare` and `feedback` return 0, or a status of the QP solver's. `action` (m,) is where the
-    action to enforce is written.
+    `prepare` and `feedback` return 0, or a status of the QP solver's (`STATUSES`). `action` (m,) is
+    where the action to enforce is written. `stagewise` says whether the QP is solved stage by stage
+    and not condensed.
     """
 
-    def __init__(self, path: str, functions: Functions, stagewise: bool) -> None:
+    def __init__(self, path: str, functions: NmpcFunctions, stagewise: bool) -> None:
         self.stagewise = stagewise
-        self._library = library_ = ctypes.CDLL(path)
-        before, after = self._memory = functions.preparation.memory, functions.readout.memory
-        library_.engine_sizes.restype = library_.engine_loop_size.restype = ctypes.c_size_t
-        library_.engine_run.restype = ctypes.c_longlong
-        sizes = [library_.engine_sizes(kind) for kind in range(3)]
-        assert sizes[:2] == [before.nbytes, after.nbytes], "Python and C lay memory out unlike"
-        work, other = np.zeros((2, sizes[2] // 8 + 1))
-        loop = np.zeros(library_.engine_loop_size() // 8 + 1)
+        self._library = ctypes.CDLL(path)
+        self._library.engine_sizes.restype = ctypes.c_size_t
+        self._library.engine_loop_size.restype = ctypes.c_size_t
+        self._library.engine_run.restype = ctypes.c_longlong
+
+        self._before = functions.preparation.memory
+        self._after = functions.readout.memory
         self.action: Vector = np.zeros(functions.problem.n_actions)
+        before_size, after_size, work_size = map(self._library.engine_sizes, range(3))
+        same = (before_size, after_size) == (self._before.nbytes, self._after.nbytes)
+        assert same, "Python and C lay memory out unlike"
+
+        # Work of a sample and of other calls: the next feedback needs the preparation's factors.
         # These pointers keep their arrays.
-        at_before, at_work, at_after, action, self._other, self._loop = (
-            array.ctypes.data_as(ctypes.c_void_p)
-            for array in (before, work, after, self.action, other, loop)
-        )
-        self._value = (at_before, at_work, at_after, None)
-        self._action_value = (at_before, at_work, at_after, action)
-        self._sizes = self.action.size, functions.blocks.size, functions.problem.n_states
+        work = _pointer(np.zeros(work_size // 8 + 1))
+        self._other_work = _pointer(np.zeros(work_size // 8 + 1))
+        self._loop = _pointer(np.zeros(self._library.engine_loop_size() // 8 + 1))
+        before = _pointer(self._before)
+        after = _pointer(self._after)
+        self._value_arguments = (before, work, after, None)
+        self._action_value_arguments = (before, work, after, _pointer(self.action))
+        self._n_states = functions.problem.n_states
+        self._n_theta = functions.blocks.size
 
     @classmethod
-    def compile(cls, functions: Functions) -> Engine | None:
+    def compile(cls, functions: NmpcFunctions, stagewise: bool | None = None) -> Engine | None:
         """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
-        A QP of many stages, or too large for an exported controller, is solved stage by stage.
+        Args:
+            functions: The controller's functions, in whose memory the engine works.
+            stagewise: Whether the QP is solved stage by stage. None leaves it to a rule: one of
+                many stages is, and one too large for an exported controller.
         """
-        problem = functions.problem
-        # A rule of thumb: where stage by stage becomes faster depends on the plant and on θ.
-        stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
-        stagewise = stagewise or stack_needed(functions) > STACK_LIMIT
+        if stagewise is None:
+            problem = functions.problem
+            # A rule of thumb: where this becomes faster depends on the plant and on θ.
+            long = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
+            stagewise = long or stack_needed(functions) > STACK_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)
         return None if path is None else cls(str(path), functions, stagewise)
 
-    def agrees(self, functions: Functions) -> bool:
+    def agrees(self, functions: NmpcFunctions) -> bool:
         """Whether the compiled functions give what CasADi's interpreter gives, at one state.
 
         Compilers have faults: gcc 12 has been seen to drop the results of a model's linearisation.
         The state is the reference, at the point and θ of the memory, which stays as it is.
         """
-        prepared, read = functions.preparation, functions.readout
-        kept = prepared.memory.copy(), read.memory.copy()
-        gradient = functions.derivatives[0]
+        prepared = functions.preparation
+        read = functions.readout
+        saved = prepared.memory.copy(), read.memory.copy()
         read.inputs["s"][:] = functions.problem.reference_state
-        same = True
-        if self.prepare() == 0:
-            linear = slice(prepared.places["A"].start, prepared.places["r"].stop)
-            compiled = prepared.memory[linear].copy()
-            prepared()
-            same = _alike(compiled, prepared.memory[linear])
+        same = self._linearisation_agrees(functions)
+        # A QP that is not solved is the feedback's to report: it says nothing of the compiler.
         if same and self.prepare() == 0 and self.feedback(False) == 0:
-            compiled = read.stack.copy()
-            read()
-            same = _alike(compiled, read.stack)
-            for name in gradient.inputs:
-                source = read if name in read.places else prepared
-                gradient.inputs[name][:] = source.memory[source.places[name]]
-            gradient()
-            same = same and _alike(read.memory[read.places["gradient"]], gradient.stack)
-        prepared.memory[:], read.memory[:] = kept
+            same = self._solution_agrees(functions)
+        prepared.memory[:], read.memory[:] = saved
         return same
+
+    def _linearisation_agrees(self, functions: NmpcFunctions) -> bool:
+        if self.prepare() != 0:
+            return True
+        prepared = functions.preparation
+        first = prepared.places["A"].start
+        last = prepared.places["r"].stop
+        compiled = prepared.memory[first:last].copy()
+        prepared()
+        return _alike(compiled, prepared.memory[first:last])
+
+    def _solution_agrees(self, functions: NmpcFunctions) -> bool:
+        """Whether the read-out and the value's gradient agree at the solution in the memory."""
+        prepared = functions.preparation
+        read = functions.readout
+        gradient, _ = functions.derivatives
+        compiled = read.stack.copy()
+        read()
+        same = _alike(compiled, read.stack)
+        for name, values in gradient.inputs.items():
+            source = read if name in read.places else prepared
+            values[:] = source.part(name)
+        gradient()
+        return same and _alike(read.part("gradient"), gradient.stack)
 
     def prepare(self) -> int:
         """Preparation phase at the point and θ that the memory holds."""
-        return int(self._library.engine_prepare(*self._value[:2]))
+        before, work, _, _ = self._value_arguments
+        return int(self._library.engine_prepare(before, work))
 
     def feedback(self, enforced: bool) -> int:
         """Feedback phase for the memory's state, with `action` enforced or not."""
-        given = self._action_value if enforced else self._value
-        return int(self._library.engine_feedback(*given))
+        arguments = self._action_value_arguments if enforced else self._value_arguments
+        return int(self._library.engine_feedback(*arguments))
 
-    def batch(self, *arrays: Vector | None) -> NDArray[np.intc]:
-        """Run `engine_batch` on its arrays; statuses of the QPs (K,), −1: derivatives by Python."""
-        assert arrays[0] is not None
-        failed = np.empty(len(arrays[0]), dtype=np.intc)
-        before, after = (memory.copy() for memory in self._memory)
-        given = [None if a is None else ctypes.c_void_p(a.ctypes.data) for a in (*arrays, failed)]
-        kept = (ctypes.c_void_p(memory.ctypes.data) for memory in (before, after))
-        self._library.engine_batch(*kept, self._other, ctypes.c_longlong(len(failed)), *given)
-        return failed
+    def solve_batch(self, batch: _Batch) -> NDArray[np.intc]:
+        """Solve the QPs of a batch and write their rows.
+
+        Returns:
+            Statuses of the QPs, (K,); −1 where the policy's derivatives are left to Python.
+        """
+        count = len(batch.states)
+        statuses = np.empty(count, dtype=np.intc)
+        x, u, _ = batch.points
+        self._library.engine_batch(
+            _pointer(self._before.copy()),
+            _pointer(self._after.copy()),
+            self._other_work,
+            ctypes.c_longlong(count),
+            _pointer(batch.states),
+            _pointer(batch.enforced),
+            _pointer(batch.theta),
+            _pointer(x),
+            _pointer(u),
+            _pointer(batch.actions),
+            _pointer(batch.values),
+            _pointer(batch.slopes),
+            _pointer(statuses),
+        )
+        return statuses
 
     def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
-        """dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
-        m, n_theta, n = self._sizes
-        found: Vector = np.empty(m * (n_theta + n))
-        at, of, to = (ctypes.c_void_p(array.ctypes.data) for array in (before, after, found))
-        # Use another workspace: the next feedback needs the preparation's factors.
-        if self._library.engine_policy(at, of, self._other, to):
+        """dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails.
+
+        Args:
+            before: Memory of the preparation, or a copy.
+            after: Memory of the read-out, or a copy, with a solution of the QP.
+        """
+        m = self.action.size
+        split = m * self._n_theta
+        jacobians: Vector = np.empty(split + m * self._n_states)
+        failed = self._library.engine_policy(
+            _pointer(before), _pointer(after), self._other_work, _pointer(jacobians)
+        )
+        if failed:
             return None
-        return found[: m * n_theta].reshape(m, n_theta), found[m * n_theta :].reshape(m, n)
+        by_theta = jacobians[:split].reshape(m, self._n_theta)
+        by_state = jacobians[split:].reshape(m, self._n_states)
+        return by_theta, by_state
 
     def begin(self) -> None:
         """Make ready for a closed loop: no earlier sample is known."""
-        before, work, after, _ = self._value
+        before, work, after, _ = self._value_arguments
         self._library.engine_begin(self._loop, before, after, work)
 
     def run(self, plant: Any, first: int, table: Vector) -> tuple[int, int, int]:
-        """Run the plant, an instance's `native`, from sample `first` on; a row of `table` each.
+        """Run the plant in a closed loop; other threads run meanwhile.
 
-        Returns the number of the sample that it came to, what failed there (0 where nothing did)
-        and FMI's status. Other threads run meanwhile.
+        Args:
+            plant: An instance's `native`.
+            first: Number of the first sample.
+            table: Where the samples go, a row each, as long as the loop is to run.
+
+        Returns:
+            The number of the sample that the loop came to, what failed there (0 where nothing did)
+            and FMI's status.
         """
         fault = (ctypes.c_int * 2)()
         reached = self._library.engine_run(
@@ -409,6 +577,11 @@ class Engine:
             fault,
         )
         return reached, fault[0], fault[1]
+
+
+def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
+    """Pointer to an array's numbers, which keeps the array; null for None."""
+    return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
 
 
 class RtiNmpc:
@@ -429,9 +602,24 @@ class RtiNmpc:
     derivatives are then those of the last QP at its own point of linearisation; the QP of `prepare`
     stays for the sample's other feedbacks, so that Q(s, π(s)) = V(s), and replay.
 
-    `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
-    or a function that makes a `QpBackend`; `functions` says whether a sample is `interpreted` or
-    `compiled` (see `compile`). Raises ControllerError on another choice.
+    `functions` says whether a sample is `interpreted` or `compiled` (see `compile`).
+
+    Args:
+        problem: The control problem.
+        parameters: θ.
+        hessian: `gauss-newton` or `exact`.
+        backend: `daqp`, `proxqp`, `qpsolvers:SOLVER`, or a function that makes a `QpBackend`.
+        iterations: Number of QPs a feedback.
+
+    Raises:
+        ControllerError: Another choice of Hessian, backend or iterations.
+
+    Example:
+        >>> problem = Problem.from_scenario(Scenario.load("paper"))
+        >>> controller = RtiNmpc(problem, Parameters.naive(problem))
+        >>> controller.prepare()
+        >>> controller.feedback([25.5, 50.0]).action.round(2)
+        array([191.72, 215.9 ])
     """
 
     name = "rti"
@@ -452,31 +640,40 @@ class RtiNmpc:
         self.iterations = iterations
         self.problem = problem
         self._compilable = hessian == "gauss-newton" and backend == "daqp"
-        horizon, m = problem.horizon, problem.n_actions
+        horizon = problem.horizon
+        m = problem.n_actions
         self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
-        self._functions = made = Functions(problem, parameters.blocks, hessian)
-        self._prepare, self._embed = made.preparation, made.embedding
-        self._readout, self._hessian = made.readout, made.hessian
-        before, after = self._prepare.memory, self._readout.memory
-        self._qp = made.qp(before, after)
-        self._bounds = self._scaled(problem.action_lower), self._scaled(problem.action_upper)
-        self._qp.lower[:], self._qp.upper[:] = np.tile(self._bounds, horizon)
+        self._functions = NmpcFunctions(problem, parameters.blocks, hessian)
+        self._prepare = self._functions.preparation
+        self._embed = self._functions.embedding
+        self._readout = self._functions.readout
+        self._hessian = self._functions.hessian
         self._engine: Engine | None = None
         self._prepared: Prepared | None = None
-        self._weigh(problem.penalty_linear, problem.penalty_quadratic)
-        self._x, self._u, self._costates = (
-            made.preparation.part(name).reshape(horizon, -1) for name in LinearisationPoint._fields
+        self._status = 0
+
+        # The QP and the point of linearisation are views of the functions' memory.
+        self._qp = self._functions.qp(self._prepare.memory, self._readout.memory)
+        self._action_bounds = (
+            self._scaled(problem.action_lower),
+            self._scaled(problem.action_upper),
         )
-        self._constant = made.preparation.part("constant")
+        self._qp.lower[:], self._qp.upper[:] = np.tile(self._action_bounds, horizon)
+        self._weigh(problem.penalty_linear, problem.penalty_quadratic)
+        self._x = self._prepare.part("x").reshape(horizon, -1)
+        self._u = self._prepare.part("u").reshape(horizon, -1)
+        self._costates = self._prepare.part("costates").reshape(horizon, -1)
+        self._constant = self._prepare.part("constant")
+
         # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
         places = self._prepare.places
-        self._point = before[places["x"].start : places["u"].stop]
+        self._point = self._prepare.memory[places["x"].start : places["u"].stop]
         self._dense = places["H"].start, places["F"].stop
         places = self._readout.places
         self._next_point = slice(places["next_x"].start, places["next_u"].stop)
-        self._next_costates, self._value = places["next_chi"], places["value"].start
-        self._controls = slice(places["v"].start, places["v"].start + m)
-        self._status = 0
+        self._next_costates = places["next_chi"]
+        self._value_place = places["value"].start
+        self._first_action = slice(places["v"].start, places["v"].start + m)
         self.parameters = parameters
         self.functions = INTERPRETED
         self.reset()
@@ -489,7 +686,10 @@ class RtiNmpc:
         same to rounding and to DAQP's accuracy (`tests/controllers/rti/test_engine.py` holds the
         bounds).
         """
-        if not self._compilable or (samples < LONG and switch() != "now") or switch() == "never":
+        chosen = switch()
+        if not self._compilable or chosen == "never":
+            return
+        if samples < LONG and chosen != "now":
             return
         reason = why_not_in_c(self._functions)
         if reason is not None:
@@ -505,8 +705,8 @@ class RtiNmpc:
             )
             engine = None
         self._engine = engine
-        self.functions = INTERPRETED if self._engine is None else COMPILED
-        self._compilable = self._engine is not None  # where it failed once it is not tried again
+        self.functions = INTERPRETED if engine is None else COMPILED
+        self._compilable = engine is not None  # where it failed once it is not tried again
         self._prepared = None
 
     # θ ------------------------------------------------------------------------------------------
@@ -563,7 +763,8 @@ class RtiNmpc:
         linearised, needs no state beyond the predicted x_N.
         """
         if self._pending is not None:
-            memory, self._pending = self._pending.memory, None
+            memory = self._pending.memory
+            self._pending = None
             self._point[:] = memory[self._next_point]
             self._costates.reshape(-1)[:] = memory[self._next_costates]
             self._prepared = None
@@ -594,13 +795,14 @@ class RtiNmpc:
 
     def _weigh(self, w: Vector, W: Vector) -> None:
         """Give the slack of the predicted stages its weights (n,), discounted."""
-        horizon, n = self.problem.horizon, self.problem.n_states
-        discounts = np.repeat(self.problem.discounts[1:], n)
+        problem = self.problem
+        price = problem.scale.state_price
+        discounts = np.repeat(problem.discounts[1:], problem.n_states)
         # Make new views: a backend recognises new weights by them.
-        self._qp.w, self._qp.W = self._prepare.part("w"), self._prepare.part("W")
-        price = self.problem.scale.state_price
-        self._qp.w[:] = discounts * np.tile(w / price, horizon)
-        self._qp.W[:] = discounts * np.tile(W * (self.problem.scale.state / price), horizon)
+        self._qp.w = self._prepare.part("w")
+        self._qp.W = self._prepare.part("W")
+        self._qp.w[:] = discounts * np.tile(w / price, problem.horizon)
+        self._qp.W[:] = discounts * np.tile(W * (problem.scale.state / price), problem.horizon)
 
     def _scaled(self, action: Vector) -> Vector:
         """The QP's variables that stand for an action (m,)."""
@@ -608,29 +810,41 @@ class RtiNmpc:
         return np.asarray((action - problem.reference_action) / problem.scale.action)
 
     def _linearise(self) -> None:
-        prepare = self._prepare
+        """Make the QP at the guess and factorise it."""
+        self._make_qp()
+        if self._engine is None:
+            self._backend.load(self._qp)
+        self._prepared = self._keep_preparation(self._engine)
+
+    def _make_qp(self) -> None:
+        """Linearise at the guess and condense; raises QpError where the QP is not finite."""
         self._prepared = None
         if self._engine is not None:
             self._status = self._engine.prepare()
             finite = self._status != NOT_FINITE
         else:
             self._constant[0] = self._hessian.fill(self._x, self._u, self._costates)
-            prepare()
-            finite = prepare.finite()
+            self._prepare()
+            finite = self._prepare.finite()
         if not finite:
             raise self._failure(
                 "the QP is not finite: the model has no finite value or derivative at the point of "
                 "linearisation",
                 "QP not finite",
             )
-        if self._engine is None:
-            self._backend.load(self._qp)
-        if self._engine is not None and self._engine.stagewise:  # all but what was not condensed
-            memory, first, last = np.empty_like(prepare.memory), *self._dense
-            memory[:first], memory[last:] = prepare.memory[:first], prepare.memory[last:]
+
+    def _keep_preparation(self, engine: Engine | None) -> Prepared:
+        """A copy of the preparation for read-outs, by an engine or, without one, by Python."""
+        source = self._prepare.memory
+        if engine is not None and engine.stagewise:
+            # All but the dense matrices, most of the memory, which were not condensed.
+            first, last = self._dense
+            memory = np.empty_like(source)
+            memory[:first] = source[:first]
+            memory[last:] = source[last:]
         else:
-            memory = prepare.memory.copy()
-        self._prepared = Prepared(memory, self._hessian.spectrum, self._functions, self._engine)
+            memory = source.copy()
+        return Prepared(memory, self._hessian.spectrum, self._functions, engine)
 
     def _failure(self, message: str, status: str) -> QpError:
         """An error with a copy of the QP, which compiled code may have left uncondensed."""
@@ -641,7 +855,9 @@ class RtiNmpc:
     def _hint(self) -> str:
         """What may be the cause of a QP without a solution: a coarse integration."""
         integration = self._functions.integration
-        return f"; the model is integrated coarsely: {integration.remedy}" * integration.coarse
+        if not integration.coarse:
+            return ""
+        return f"; the model is integrated coarsely: {integration.remedy}"
 
     @property
     def linearisation_point(self) -> LinearisationPoint:
@@ -654,9 +870,19 @@ class RtiNmpc:
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> RtiSolution:
         """Feedback phase: V(s) and π(s), or Q(s, a) where `a` is given.
 
-        s (n,) and a (m,) in the units of the model; an enforced action replaces the bounds of the
-        first control. The next `prepare` shifts this solution. Raises QpError where s is not finite
-        or the QP is not solved; ControllerError on wrong shapes.
+        The next `prepare` shifts this solution.
+
+        Args:
+            s: State in the model's units, (n,).
+            a: Action to enforce in the model's units, (m,): it replaces the bounds of u_0. None
+                leaves the action to the policy.
+
+        Returns:
+            The solution of the QP; its derivatives are computed when they are asked for.
+
+        Raises:
+            QpError: s is not finite, or the QP is not solved.
+            ControllerError: An array has a wrong shape.
         """
         solution = self._solve(s, a)
         self._pending = solution
@@ -675,91 +901,119 @@ class RtiNmpc:
         return solution
 
     def _solve_qp(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
+        """Solve the prepared QP for a state; raises QpError where it is not solved."""
         problem = self.problem
-        s = _vector("state", s, problem.reference_state.size)
+        state = _vector("state", s, problem.n_states)
         if self._prepared is None:
             self.prepare()
         prepared = self._prepared
         assert prepared is not None
-        self._readout.inputs["s"][:] = s
-        if a is not None:
-            a = _vector("action", a, problem.reference_action.size)
-        solve = self._solve_interpreted if self._engine is None else self._solve_compiled
+        self._readout.inputs["s"][:] = state
+        action = None if a is None else _vector("action", a, problem.n_actions)
         try:
-            finite = solve(s, a)
+            if self._engine is None:
+                finite = self._solve_interpreted(action)
+            else:
+                status = self._solve_compiled(self._engine, action)
+                finite = status != NOT_FINITE
+                if status not in (0, NOT_FINITE):
+                    if not self._engine.stagewise:
+                        word = STATUSES[status]
+                        raise self._failure(f"the QP was not solved: {word}", word)
+                    # What is left unsolved stage by stage is solved condensed.
+                    prepared = self._condense()
+                    finite = self._solve_interpreted(action)
         except QpError as error:
-            if self._engine is None:  # the backend knows nothing of the model
+            if prepared.engine is None:  # the backend knows nothing of the model
                 error.args = (f"{error}{self._hint()}",)
             raise
         if not finite:
-            message = f"the QP is not finite: state {s}, action {a!r}"
+            message = f"the QP is not finite: state {state}, action {action!r}"
             raise self._failure(message, "state or action not finite")
+        return self._solution(prepared, enforced=action is not None)
+
+    def _solution(self, prepared: Prepared, *, enforced: bool) -> RtiSolution:
+        """The solution in the read-out's memory."""
+        problem = self.problem
         memory = self._readout.memory.copy()
         return RtiSolution(
-            action=memory[self._controls] * problem.scale.action + problem.reference_action,
-            value=float(memory[self._value]),
+            action=memory[self._first_action] * problem.scale.action + problem.reference_action,
+            value=float(memory[self._value_place]),
             prepared=prepared,
             memory=memory,
-            enforced=a is not None,
+            enforced=enforced,
         )
 
-    def _solve_compiled(self, s: Vector, a: Vector | None) -> bool:
-        """Solve; whether state and action are finite."""
-        engine = self._engine
-        assert engine is not None
+    def _solve_compiled(self, engine: Engine, a: Vector | None) -> int:
+        """Solve in compiled code; 0 or a status."""
         if a is not None:
             engine.action[:] = a
-        status = self._status or engine.feedback(a is not None)
-        if status not in (0, NOT_FINITE):
-            raise self._failure(f"the QP was not solved: {STATUSES[status]}", STATUSES[status])
-        return status == 0
+        return self._status or engine.feedback(a is not None)
 
-    def _solve_interpreted(self, s: Vector, a: Vector | None) -> bool:
-        qp, read, m = self._qp, self._readout, self._bounds[0].size
-        self._embed()
-        qp.lower[:m], qp.upper[:m] = self._bounds
-        if a is not None:
-            qp.lower[:m] = qp.upper[:m] = self._scaled(a)
-        if not self._embed.finite() or not (a is None or all(map(isfinite, a.tolist()))):
+    def _condense(self) -> Prepared:
+        """Make the condensed QP at an engine's point, and the preparation without the engine."""
+        self._prepare()
+        self._backend.load(self._qp)
+        return self._keep_preparation(None)
+
+    def _solve_interpreted(self, a: Vector | None) -> bool:
+        """Solve by CasADi's functions and the backend; whether state and action are finite."""
+        if not self._embed_state(a):
             return False
-        read.inputs["constant"][0] = self._constant[0]
-        found = self._backend.solve(qp)
-        residual = self._read(found, a is not None)
-        if not residual <= ACCURATE:
-            residual = self._read(polish(qp, found), a is not None)
-        if not residual <= RESIDUAL:
-            raise QpError(
-                f"the QP was solved too inaccurately: its KKT residual is {residual:.1e}, more "
-                f"than {RESIDUAL:g}; is the model unstable over so long a horizon?",
-                status=INACCURATE,
-                qp=qp.copy(),
-            )
+        self._accept(self._backend.solve(self._qp), enforced=a is not None)
         return True
 
-    def _read(self, found: QpSolution, enforced: bool) -> float:
+    def _embed_state(self, a: Vector | None) -> bool:
+        """Put the state, and an action to enforce, into the QP; whether all is finite."""
+        qp = self._qp
+        m = self.problem.n_actions
+        self._embed()
+        qp.lower[:m], qp.upper[:m] = self._action_bounds
+        if a is not None:
+            qp.lower[:m] = qp.upper[:m] = self._scaled(a)
+        self._readout.inputs["constant"][0] = self._constant[0]
+        return self._embed.finite() and (a is None or all(map(isfinite, a.tolist())))
+
+    def _accept(self, solution: QpSolution, *, enforced: bool) -> None:
+        """Read a solution out, polished if need be; raises QpError where it is inaccurate."""
+        residual = self._read(solution, enforced)
+        if not residual <= ACCURATE_RESIDUAL:
+            residual = self._read(polish(self._qp, solution), enforced)
+        if not residual <= SOLVED_RESIDUAL:
+            raise QpError(
+                f"the QP was solved too inaccurately: its KKT residual is {residual:.1e}, more "
+                f"than {SOLVED_RESIDUAL:g}; is the model unstable over so long a horizon?",
+                status=INACCURATE,
+                qp=self._qp.copy(),
+            )
+
+    def _read(self, solution: QpSolution, enforced: bool) -> float:
         """Read a solution of the QP out; its residual."""
         if enforced:
-            found = multipliers_at_kink(self._qp, found, *self._bounds)
+            solution = multipliers_at_kink(self._qp, solution, *self._action_bounds)
         read = self._readout
-        for name, values in found._asdict().items():
-            read.inputs[name][:] = values
+        read.inputs["v"][:] = solution.v
+        read.inputs["nu"][:] = solution.nu
+        read.inputs["lam"][:] = solution.lam
         read()
         return float(read.part("residual")[0])
 
     def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:
         """A new closed loop in compiled code; None if only Python can run it.
 
-        That is before `compile`, with several iterations, in a subclass that samples otherwise, and
-        where the scenario saturates otherwise than the problem.
+        That is before `compile`, with several iterations, where the QP is solved stage by stage,
+        since what that leaves unsolved is solved in Python, in a subclass that samples otherwise,
+        and where the scenario saturates otherwise than the problem.
         """
-        own, problem = type(self), self.problem
-        changed = (own.prepare, own.feedback) != (RtiNmpc.prepare, RtiNmpc.feedback)
-        if self._engine is None or self.iterations > 1 or changed:
+        if self._engine is None or self._engine.stagewise or self.iterations > 1:
+            return None
+        kind = type(self)
+        if kind.prepare is not RtiNmpc.prepare or kind.feedback is not RtiNmpc.feedback:
             return None
         for name in ("action_lower", "action_upper", "reference_action"):
-            if not np.array_equal(getattr(scenario, name), getattr(problem, name)):
+            if not np.array_equal(getattr(scenario, name), getattr(self.problem, name)):
                 return None
-        if len(scenario.plant.states) != problem.n_states:
+        if len(scenario.plant.states) != self.problem.n_states:
             return None
         self.reset()
         self._engine.begin()
@@ -779,53 +1033,76 @@ class RtiNmpc:
         points: LinearisationPoint | None = None,
         *,
         derivatives: bool = False,
-    ) -> tuple[Vector, ...]:
-        """π (K, m) and V (K,) at states (K, n), or Q where actions (K, m) are enforced.
+    ) -> BatchSolution:
+        """π and V at many states, or Q where actions are enforced; the controller keeps its own.
 
-        With `derivatives` follow dV/ds (K, n), dV/dθ (K, n_θ), dQ/da (K, m), dπ/dθ (K, m, n_θ) and
-        dπ/ds (K, m, n), zero where there is none. Where a QP is not solved π and V are NaN. θ, one
-        or K, and points of linearisation, arrays of K rows, are the controller's own where they are
-        not given; it keeps its own. Raises ControllerError on a wrong shape.
+        Args:
+            states: States s, (K, n).
+            theta: θ, (n_θ,) or (K, n_θ); the controller's own where it is None.
+            enforced: Actions a, (m,) or (K, m), where Q(s, a) is wanted.
+            points: Points of linearisation, arrays of one or of K rows; the controller's own where
+                they are None.
+            derivatives: Whether to compute them too.
+
+        Returns:
+            A row a state; π and V are NaN where a QP is not solved.
+
+        Raises:
+            ControllerError: An array has a wrong shape.
         """
-        n, m, size = self.problem.n_states, self.problem.n_actions, self.theta.size
         if self._prepared is None:
             self.prepare()
-        guess = self._x.copy(), self._u.copy(), self._costates.copy()
+        problem = self.problem
+        n = problem.n_states
         if np.ndim(states) != 2:
             raise ControllerError(f"the states must have shape (K, {n}), not {np.shape(states)}")
         count = len(np.asarray(states))
-        s = _rows("states", states, count, (n,))
-        a = None if enforced is None else _rows("actions", enforced, count, (m,))
-        thetas = _rows("θ", self.theta if theta is None else theta, count, (size,))
-        pairs = zip(points or guess, guess, strict=True)
-        each = [_rows("points", given, count, own.shape) for given, own in pairs]
-        actions, values = np.full((count, m), np.nan), np.full(count, np.nan)
-        slopes = np.zeros((count, n + size + m + m * (size + n))) if derivatives else None
-        left = np.arange(count)
+        guess = self._guess()
+        given = guess if points is None else points
+        batch = _Batch(
+            _rows("states", states, count, (n,)),
+            None if enforced is None else _rows("actions", enforced, count, (problem.n_actions,)),
+            _rows("θ", self.theta if theta is None else theta, count, self.theta.shape),
+            LinearisationPoint(
+                x=_rows("points", given[0], count, guess.x.shape),
+                u=_rows("points", given[1], count, guess.u.shape),
+                costates=_rows("points", given[2], count, guess.costates.shape),
+            ),
+            derivatives=derivatives,
+        )
+        rest = np.arange(count)
         if self._engine is not None and self.iterations == 1:
-            failed = self._engine.batch(s, a, thetas, *each[:2], actions, values, slopes)
-            left = np.flatnonzero(failed < 0)
-        kept, pending = self._parameters, self._pending
-        for k in left:
-            with suppress(QpError, ParameterError):
-                self.theta, self._pending = thetas[k], None
-                self._linearise_at(LinearisationPoint(*(part[k] for part in each)))
-                found = self._solve(s[k], None if a is None else a[k])
-                actions[k], values[k] = found.action, found.value
-                if slopes is not None:
-                    own = found.costates[0], found.value_gradient, found.action_gradient
-                    flat = np.concatenate(
-                        [*own, *map(np.ravel, () if found.enforced else found._policy)]
-                    )
-                    slopes[k, : flat.size] = flat
-        if len(left):
-            self.parameters = kept
-            self._linearise_at(LinearisationPoint(*guess))
+            statuses = self._engine.solve_batch(batch)
+            left = statuses < 0
+            if self._engine.stagewise:  # what is left unsolved stage by stage is solved condensed
+                left |= statuses > 0
+            rest = np.flatnonzero(left)
+        if len(rest):
+            self._solve_rows(batch, rest.tolist())
+        return batch.solution()
+
+    def _guess(self) -> LinearisationPoint:
+        """A copy of the point of linearisation."""
+        return LinearisationPoint(self._x.copy(), self._u.copy(), self._costates.copy())
+
+    def _solve_rows(self, batch: _Batch, rows: Iterable[int]) -> None:
+        """Solve rows of a batch one after the other, then be as before."""
+        parameters = self._parameters
+        pending = self._pending
+        guess = self._guess()
+        try:
+            for k in rows:
+                # A row without a solution stays NaN.
+                with suppress(QpError, ParameterError):
+                    self.theta = batch.theta[k]
+                    self._pending = None
+                    self._linearise_at(batch.point(k))
+                    a = None if batch.enforced is None else batch.enforced[k]
+                    batch.write(k, self._solve(batch.states[k], a))
+        finally:
+            self.parameters = parameters
+            self._linearise_at(guess)
             self._pending = pending
-        if slopes is None:
-            return actions, values
-        *by, policy_theta, policy_s = np.split(slopes, np.cumsum([n, size, m, m * size]), axis=1)
-        return actions, values, *by, policy_theta.reshape(-1, m, size), policy_s.reshape(-1, m, n)
 
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q(s, a) of the prepared QP."""

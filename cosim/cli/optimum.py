@@ -68,7 +68,7 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cl
 def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
-    from controllers.dynamic_programming import Figure, Settings, certify, objection, solve
+    from controllers.dynamic_programming import Estimate, Settings, certify, objection, solve
     from controllers.problem import PlantProblem
 
     plant, settings = PlantProblem.from_scenario(task), Settings()
@@ -82,7 +82,7 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     certificate = found.certificate
     why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
     kind = "reference" if why_not else "optimum"
-    figures = certificate or [Figure("solution", found.gain, found.lower, found.upper)]
+    figures = certificate or [Estimate("solution", found.gain, found.lower, found.upper)]
     rows = [(name, *(f"{x:.4f}" for x in numbers)) for name, *numbers in figures]
     states = " × ".join(map(str, found.grid.shape))
     title = f"{kind} of {task.name}: J = {found.gain:.4f} on {states} states"

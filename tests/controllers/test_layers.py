@@ -102,7 +102,7 @@ def test_the_outputs_have_the_precision_of_the_states(case):
     s = torch.tensor(states, dtype=torch.float32)
     actions, values = torch_layer(controller)(s, torch.tensor(theta, requires_grad=True))
     assert actions.dtype == values.dtype == torch.float32
-    expected = controller.feedback_batch(s, theta=theta)[0]
+    expected = controller.feedback_batch(s, theta=theta).action
     np.testing.assert_allclose(actions.detach(), expected, rtol=1e-6)
 
 

@@ -78,13 +78,14 @@ def compare_all(n, m, horizon, n_d, n_p):
         assert solution.policy_state_jacobian.shape == (m, n)
         assert solution.residual < 1e-6 and enforced.action_gradient.shape == (m,)
         controller.reset()
-        actions, batch, *_, by_theta, by_state = controller.feedback_batch(
-            np.stack([s, s]), derivatives=True
-        )
-        assert actions.shape == (2, m) and by_theta.shape == (2, m, blocks.size)
+        batch = controller.feedback_batch(np.stack([s, s]), derivatives=True)
+        assert batch.action.shape == (2, m)
+        assert batch.policy_jacobian.shape == (2, m, blocks.size)
         if kind in ("gauss-newton", "exact"):
-            np.testing.assert_allclose(batch, solution.value, rtol=1e-9)
-            np.testing.assert_allclose(by_state[0], solution.policy_state_jacobian, atol=1e-9)
+            np.testing.assert_allclose(batch.value, solution.value, rtol=1e-9)
+            np.testing.assert_allclose(
+                batch.policy_state_jacobian[0], solution.policy_state_jacobian, atol=1e-9
+            )
     for found in values.values():
         np.testing.assert_allclose(found, np.broadcast_to(found[0], (len(found), 2)), rtol=1e-8)
 

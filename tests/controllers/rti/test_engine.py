@@ -116,7 +116,8 @@ def test_a_batch_is_the_feedback_of_each_state_and_moves_no_guess(learnt):
     for controller in (ours, reference):
         controller.feedback(states[0])
         controller.prepare()
-        actions, values = controller.feedback_batch(states)
+        batch = controller.feedback_batch(states)
+        actions, values = batch.action, batch.value
         assert np.isnan(values[7]) and np.isnan(actions[7]).all()
         for k in known:
             assert np.array_equal(controller.policy(states[k]), actions[k])

@@ -62,20 +62,14 @@ def test_compiled_code_gives_the_interpreters_digits(call, monkeypatch):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.sanitised
-@pytest.mark.parametrize(
-    "call",
-    [
-        pytest.param(
-            call,
-            marks=pytest.mark.xfail(
-                call == "large graph", reason="V is off by 6e-8 at one of 40 states", strict=True
-            ),
-        )
-        for call in CALLS
-    ],
-)
+@pytest.mark.parametrize("call", CALLS)
 def test_sanitizers_find_nothing_in_exported_c(call, tmp_path):
-    """The exact Hessian calls the model's second derivatives too."""
+    """The exact Hessian calls the model's second derivatives too.
+
+    At random states the guess is far from the solution, and a difference of it grows: 1e-15 in the
+    first state of "large graph" is 1e-5 of V forty samples later, in the interpreter alone. So both
+    begin anew every `RESTART` samples.
+    """
     problem = calling(CALLS[call], horizon=3)
     exported = core(problem, theta(problem), "exact")
     (tmp_path / "main.c").write_text(MAIN)
@@ -92,7 +86,9 @@ def test_sanitizers_find_nothing_in_exported_c(call, tmp_path):
     assert done.returncode == 0, done.stderr
     rows = np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
     controller = RtiNmpc(problem, exported.parameters, hessian="exact")
-    for s, (status, value) in zip(given, rows, strict=True):
+    for k, (s, (status, value)) in enumerate(zip(given, rows, strict=True)):
+        if k % RESTART == 0:
+            controller.reset()
         controller.prepare()
         try:
             expected = controller.feedback(s).value
@@ -104,7 +100,12 @@ def test_sanitizers_find_nothing_in_exported_c(call, tmp_path):
         assert value == pytest.approx(expected, rel=1e-8)
 
 
-MAIN = """
+RESTART = 8
+"""Samples after which both controllers forget their guess."""
+
+MAIN = (
+    f"#define RESTART {RESTART}"
+    + """
 #include <stdio.h>
 #include "core.h"
 int main(void) {
@@ -112,8 +113,8 @@ int main(void) {
     double theta[N_THETA], s[N_X];
     for (int i = 0; i < N_THETA; i++)
         if (scanf("%lf", &theta[i]) != 1) return 1;
-    core_reset(&state);
-    for (;;) {
+    for (int k = 0;; k++) {
+        if (k % RESTART == 0) core_reset(&state);
         for (int i = 0; i < N_X; i++)
             if (scanf("%lf", &s[i]) != 1) return 0;
         core_act(&state, s, 0, theta);
@@ -122,6 +123,7 @@ int main(void) {
     }
 }
 """
+)
 
 
 @pytest.fixture

@@ -49,6 +49,22 @@ class Plant(Protocol):
         """Hold the action a (m,) for one sampling time."""
 
 
+class ActionLimits(Protocol):
+    """What a closed loop knows of the actuators; a scenario has it, and a controller's problem."""
+
+    @property
+    def action_lower(self) -> Array:
+        """Lower bounds of the actions, (m,)."""
+
+    @property
+    def action_upper(self) -> Array:
+        """Upper bounds of the actions, (m,)."""
+
+    @property
+    def reference_action(self) -> Array:
+        """The action of the reference steady state, (m,)."""
+
+
 class Solution(Protocol):
     """The result of a controller's `feedback`."""
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from cosim.core.errors import CosimError, PlantError, RunEndedError
+from cosim.core.loop import ClosedLoop, Sample, controller_name
 from cosim.core.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
 from cosim.core.scenario import Scenario
 from cosim.core.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
@@ -56,10 +57,9 @@ def simulate(
     the scenario's bounds. `recorder` gets the run in parts; `progress` the number of samples done;
     True draws a bar. Without `residuals` the KKT residuals, which may cost time, are NaN.
 
-    A failed solve is an exception whose class has `is_solver_failure`. The last applied action
-    (first the scenario's reference action) is then applied again, the failure is counted, and the
-    controller is reset. Every other error is raised; where the plant fails in mid run it is a
-    RunEndedError, whose `trajectory` has the samples before.
+    A failed solve has the consequence that `ClosedLoop` says, and is counted. Every other error is
+    raised; where the plant fails in mid run it is a RunEndedError, whose `trajectory` has the
+    samples before.
     """
     steps = whole_number("steps", steps, 1, CosimError)
     run = _Run(plant, controller, steps, seed, residuals)
@@ -96,6 +96,7 @@ class _Run:
         self, plant: Plant, controller: Controller, steps: int, seed: int, residuals: bool
     ) -> None:
         self._plant, self._controller = plant, controller
+        self._loop = ClosedLoop(plant.step, controller, plant.scenario)
         self._scenario: Scenario = plant.scenario
         self._seed, self._steps, self._residuals = seed, steps, residuals
         self._length = min(max(PART, steps // 200), 10 * PART)
@@ -120,48 +121,54 @@ class _Run:
     def interpreted(
         self, record: Callable[..., None] | None, progress: Callable[[int], None]
     ) -> None:
-        plant, rows = self._plant, list[list[float]]()
-        s = plant.reset(spawn_seeds(self._seed)[0])
-        self._controller.reset()
-        applied = self._scenario.reference_action
+        """Run the loop in Python.
+
+        Args:
+            record: gets each part of the run; None: nobody does.
+            progress: is called with the number of samples done.
+        """
+        rows: list[list[float]] = []
+        loop = self._loop
+        loop.start(self._plant.reset(spawn_seeds(self._seed)[0]))
         try:
             for k in range(self._steps):
-                s.flags.writeable = False  # for the controller
-                solution, prepare_time, feedback_time = self._solve(s)
-                applied = self._applied(applied if solution is None else solution.action, k)
-                begin = perf_counter()
-                step = plant.step(applied)
-                plant_time = perf_counter() - begin
-                value = residual = nan
-                if solution is not None:
-                    value = self._number(solution, "value", k)
-                    if self._residuals:
-                        residual = self._number(solution, "residual", k)
-                row = [*s.tolist(), *applied.tolist(), step.stage_cost, *step.disturbance.tolist()]
-                row += [value, residual, solution is None, prepare_time, feedback_time, plant_time]
-                rows.append(row)
-                s = step.s
+                sample = loop.advance()
+                rows.append(self._row(sample))
+                solution = sample.solution
+                self._status.append(FALLBACK if solution is None else solution.status)
                 if record is not None and solution is not None:
                     self._keep_prediction(k, solution)
                 if (k + 1) % self._length == 0 or k + 1 == self._steps:
                     self._store(rows, record)
                     progress(k + 1)
         except PlantError:
-            self._store(rows, record)  # the samples before
+            # The samples before.
+            self._store(rows, record)
             raise
         finally:
-            self._final_state = s
+            self._final_state = loop.s
 
-    def _applied(self, action: object, k: int) -> Array:
-        """The action within the actuators' bounds; raises CosimError where it is none."""
-        shape = self._scenario.action_lower.shape
-        if isinstance(action, np.ndarray) and action.dtype.kind in "fiu":
-            if action.shape == shape:
-                return self._scenario.saturate(action)
-            given = f"shape {action.shape}"
-        else:
-            given = f"{type(action).__name__} {action}"
-        raise self._wrong(f"an action of {given}, not {shape}", k)
+    def _row(self, sample: Sample) -> list[float]:
+        """A sample's row of the table, in the order of `MEASURED`."""
+        solution = sample.solution
+        step = sample.step
+        value = residual = nan
+        if solution is not None:
+            value = self._number(solution, "value")
+            if self._residuals:
+                residual = self._number(solution, "residual")
+        return [
+            *sample.s.tolist(),
+            *sample.a.tolist(),
+            step.stage_cost,
+            *step.disturbance.tolist(),
+            value,
+            residual,
+            solution is None,
+            sample.prepare_time,
+            sample.feedback_time,
+            sample.plant_time,
+        ]
 
     def _store(self, rows: list[list[float]], record: Callable[..., None] | None) -> None:
         """Store the rows that are not stored yet, hand them to the recorder, and forget them."""
@@ -212,39 +219,17 @@ class _Run:
                 stored[kind.name][:] = kind.of(self._scenario, stored)
         return stored
 
-    def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
-        """Prepare and feed back, timed apart; None if the controller declares a failure."""
-        controller = self._controller
-        solution: Solution | None = None
-        begin = middle = perf_counter()
-        try:
-            controller.prepare()
-            middle = perf_counter()
-            solution = controller.feedback(s)
-            end = perf_counter()
-            if not hasattr(solution, "action"):
-                raise self._wrong(f"a {type(solution).__name__}, which is no solution")
-            if not isinstance(status := getattr(solution, "status", None), str):
-                raise self._wrong(f"a status that is no text but {status!r:.60}")
-        except Exception as error:
-            end = perf_counter()
-            recover(controller, error)
-        self._status.append(FALLBACK if solution is None else solution.status)
-        return solution, middle - begin, end - middle
-
-    def _number(self, solution: Solution, name: str, k: int) -> float:
+    def _number(self, solution: Solution, name: str) -> float:
         """A field of a solution that is a number; raises CosimError where it is none."""
-        given = getattr(solution, name, None)
-        if type(given) is float:
-            return given
-        if isinstance(given, bool) or not isinstance(given, int | float | np.integer | np.floating):
-            shown = " ".join(f"{given!r:.60}".split())
-            raise self._wrong(f"a {name} that is no number but {shown}", k)
-        return float(given)
-
-    def _wrong(self, given: str, k: int | None = None) -> CosimError:
-        at = "" if k is None else f", at step {k}"
-        return CosimError(f"{controller_name(self._controller)} gave {given}{at}")
+        value = getattr(solution, name, None)
+        if type(value) is float:
+            return value
+        numbers = int | float | np.integer | np.floating
+        if isinstance(value, bool) or not isinstance(value, numbers):
+            shown = " ".join(f"{value!r:.60}".split())
+            number = self._loop.number - 1
+            raise self._loop.wrong(f"a {name} that is no number but {shown}", number)
+        return float(value)
 
     def _keep_prediction(self, k: int, solution: Solution) -> None:
         given: Any = {name: getattr(solution, name) for name in PREDICTED}
@@ -257,7 +242,8 @@ class _Run:
             for name, values in given.items():
                 self._predicted[name][k % self._length] = values
         except (TypeError, ValueError) as error:
-            raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
+            shape_error = self._loop.wrong(f"a prediction of another shape or kind ({error})", k)
+            raise shape_error from None
 
     def trajectory(self) -> Trajectory:
         scenario = self._scenario
@@ -281,22 +267,10 @@ class _Run:
         )
 
 
-def recover(controller: Controller, error: Exception) -> None:
-    """Reset a controller that declared this failure; raise every other error."""
-    if not getattr(type(error), "is_solver_failure", False):
-        raise error
-    controller.reset()
-
-
 def functions_of(controller: Any) -> str | None:
     """How a controller's functions are computed, `interpreted` or `compiled`; None without any."""
     mode = getattr(controller, "functions", None)
     return mode if isinstance(mode, str) else None
-
-
-def controller_name(controller: Any) -> str:
-    """Name of a controller for tables: its `name`, else its class's."""
-    return str(getattr(controller, "name", type(controller).__name__))
 
 
 # key performance indicators of a run

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.export.core import core
+from controllers.export.core import SOURCES, core
 from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
@@ -63,11 +63,14 @@ class Rollout:
             "sizes.h": c_definitions(sizes),
             # Where a function says that it is exported, Windows exports no other.
             "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
+            "loop.h": (SOURCES / "loop.h").read_bytes(),
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
         path = library(sources)
         if path is not None:
-            self.compiled = ctypes.CDLL(str(path)).rollout
+            compiled = ctypes.CDLL(str(path))
+            self.compiled = compiled.rollout
+            self._n_columns = int(compiled.rollout_columns())
 
     def __call__(
         self,
@@ -107,18 +110,20 @@ class Rollout:
         picks: NDArray[np.int32],
     ) -> RolloutSamples:
         """One rollout in C (`rollout.c`)."""
-        steps = len(picks)
-        inputs = np.empty((steps, self._features.n_inputs))
-        predicted = np.empty((steps, self._features.n_outputs))
-        h = np.empty((steps, self._features.n_outputs))
+        features = self._features
+        n_samples = len(picks)
         c, W = model.coefficients
         # C reads rows, one after the other.
         arguments = []
         for array in (theta, start, c, W, model.residuals, picks):
             arguments.append(np.ascontiguousarray(array))
         assert self.compiled is not None
-        done = self.compiled(*pointers(*arguments), steps, *pointers(inputs, predicted, h))
-        return RolloutSamples(inputs[:done], predicted[:done], h[:done])
+        # A row is the one of every closed loop: state and action, the plant's outputs, and more.
+        ends = np.cumsum([features.n_inputs, features.n_outputs, features.n_outputs])
+        table = np.empty((n_samples, self._n_columns))
+        done = self.compiled(*pointers(*arguments), n_samples, *pointers(table))
+        inputs, predicted, h, _ = np.split(table[:done], ends, axis=1)
+        return RolloutSamples(inputs.copy(), predicted.copy(), h.copy())
 
     def _interpreted(
         self,

@@ -326,7 +326,7 @@ class Engine:
         stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
         stagewise = stagewise or stack_needed(functions) > STACK_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
-        for name in ("sensitivities.h", "engine.c"):
+        for name in ("sensitivities.h", "loop.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)
         return None if path is None else cls(str(path), functions, stagewise)

@@ -85,14 +85,10 @@ def check(
     """
     with output(json) as out_:
         from cosim.core.errors import FmuWarning, PlantError
-        from cosim.core.processes import watch
         from cosim.plant.check import PlantCheck, check_plant
-        from cosim.plant.fmi import SHIPPED
 
         path = Path(file).absolute()
         try:
-            if file not in SHIPPED:
-                watch(f"FMU '{path}', or other native code,")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", FmuWarning)  # the table says the same
                 found = check_plant(

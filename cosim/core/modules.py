@@ -17,8 +17,6 @@ from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
 
-from cosim.core.processes import watch
-
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 """Form of an object's name, `module:Name`."""
 OURS = ("fmus", "cosim", "controllers", "learning")
@@ -99,8 +97,6 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
         raise error(f"{what} must be given as module:Name, not '{target}'")
     module, _, attribute = target.partition(":")
     foreign = module.partition(".")[0] not in OURS
-    if foreign:
-        watch(f"plug-in '{target}'")
     try:
         with importing():
             if foreign:

@@ -1,4 +1,4 @@
-"""Processes and signals: who ends with whom, who writes where, and foreign code in a child."""
+"""Processes and signals: who ends with whom, and who writes where."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import IO, TYPE_CHECKING, Any, NoReturn
+from typing import IO, TYPE_CHECKING
 
-from cosim.core.errors import CosimError, PlantError
-from cosim.core.files import STAGED, lock, temporary_folder, write_atomically
+from cosim.core.errors import CosimError
+from cosim.core.files import STAGED, lock, write_atomically
 
 # psutil and filelock are imported where they are needed: every command imports this file.
 if TYPE_CHECKING:
@@ -36,8 +36,6 @@ class Interrupted(BaseException):
 unwound = threading.Event()
 """Set while no command runs in this process, and once one has unwound: signals are then ignored."""
 unwound.set()
-_watched = False
-"""Whether another process has started this one, and watches it."""
 _SIGNALS = [
     getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)
 ]
@@ -45,7 +43,7 @@ _SIGNALS = [
 
 @contextmanager
 def command_process() -> Iterator[None]:
-    """Run a command: foreign code in it is watched, and signals unwind it.
+    """Run a command so that signals unwind it.
 
     Ctrl-C raises KeyboardInterrupt, SIGTERM and SIGHUP `Terminated`, once. Signals that the caller
     ignores, as nohup and a shell's background jobs do, stay ignored. Restores the previous
@@ -234,88 +232,24 @@ def _release(folder: Path) -> None:
     held.release()
 
 
-_stdout: list[int] = []
-"""Descriptor of standard output while it is turned aside."""
-
-
 @contextmanager
 def redirected_output() -> Iterator[int | None]:
-    """Redirect standard output, of native code too, to standard error; yields the true descriptor.
+    """Redirect standard output, of native code too, to standard error.
 
-    It is None where standard output is not this process's own, as in a test runner.
+    Yields:
+        The descriptor of the true standard output; None where standard output is not this
+        process's own, as in a test runner.
     """
-    own = sys.stdout is sys.__stdout__
-    if not own:
+    is_ours = sys.stdout is sys.__stdout__
+    if not is_ours:
         yield None
         return
     sys.stdout.flush()
-    _stdout.append(os.dup(1))
+    descriptor = os.dup(1)
     os.dup2(2, 1)
     try:
-        yield _stdout[-1]
+        yield descriptor
     finally:
         sys.stdout.flush()
-        os.dup2(_stdout[-1], 1)
-        os.close(_stdout.pop())
-
-
-class Finished(BaseException):
-    """A watched command has ended; its argument is the exit code."""
-
-
-def run_watched(main: Callable[[], None], parent: int, mark: str) -> NoReturn:
-    """Run the command line for a watching process; create the file `mark` at its end.
-
-    It is missing where foreign code calls `exit(0)` or is killed. Threads that foreign code has
-    left do not keep the process.
-    """
-    global _watched  # noqa: PLW0603
-    _watched = True
-    follow_parent(parent)
-    code: Any = 0
-    try:
-        main()
-    except SystemExit as error:
-        code = error.code
-    try:
-        sys.stdout.flush()
-    except (OSError, ValueError, AttributeError):  # closed, or taken away by foreign code
-        code = code or 1
-    Path(mark).touch()
-    os._exit(code or 0)
-
-
-def watch(suspect: str) -> None:
-    """Run this command again in a child process, and exit as that does.
-
-    To be called before foreign code, `suspect` in messages, is loaded. Returns in that child, and
-    where no command line was called. Raises PlantError where the child ended before the command.
-    """
-    if unwound.is_set() or _watched:
-        return
-    flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
-    folders = release()  # for the process that does the work
-    with temporary_folder("cosim-") as temporary:
-        mark = temporary / "finished"
-        # Pass on the import path: a folder of the user's may have the name of a package.
-        program = (
-            f"import sys; sys.path[:] = {sys.path}; from cosim import cli; "
-            f"from cosim.core import processes; processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"
-        )
-        words = [sys.executable, *flags, "-c", program, *sys.argv[1:]]
-        child = subprocess.Popen(words, stdout=(*_stdout, None)[0])
-        try:
-            code = child.wait()
-        except BaseException as error:
-            if not isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the child, too
-                child.terminate()
-            child.wait()
-            raise
-        finished = mark.exists()
-    if finished and code >= 0:
-        raise Finished(code)
-    for folder in folders:  # so that the locks of a process that was killed are cleared away
-        with suppress(CosimError, OSError):
-            hold(folder)
-    how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-    raise PlantError(f"{suspect} ended the process {how} before the command finished")
+        os.dup2(descriptor, 1)
+        os.close(descriptor)

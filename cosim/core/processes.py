@@ -50,8 +50,11 @@ def command_process() -> Iterator[None]:
     handlers; at interpreter shutdown the signals are ignored.
     """
     unwound.clear()
-    own = (signal.SIG_DFL, signal.default_int_handler)
-    before = {n: signal.signal(n, _raise) for n in _SIGNALS if signal.getsignal(n) in own}
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    before = {}
+    for number in _SIGNALS:
+        if signal.getsignal(number) in defaults:
+            before[number] = signal.signal(number, _raise)
     try:
         yield
     finally:
@@ -63,15 +66,21 @@ def command_process() -> Iterator[None]:
 
 def _raise(number: int, _: FrameType | None) -> None:
     """Raise the signal's exception, and again after a second in case C code has cleared it."""
-    found = sys.exception()
-    while found is not None and not isinstance(found, KeyboardInterrupt | Terminated):
-        found = found.__context__
-    if unwound.is_set() or found is not None:
+    # While one of them unwinds the command, a second signal is ignored.
+    unwinding = sys.exception()
+    while unwinding is not None and not isinstance(unwinding, KeyboardInterrupt | Terminated):
+        unwinding = unwinding.__context__
+    if unwound.is_set() or unwinding is not None:
         return
 
     def again() -> None:
-        if not unwound.is_set():
-            signal.raise_signal(number) if os.name == "nt" else os.kill(os.getpid(), number)
+        if unwound.is_set():
+            return
+        # In a thread: only the process as a whole reaches the main thread.
+        if os.name == "nt":
+            signal.raise_signal(number)
+        else:
+            os.kill(os.getpid(), number)
 
     timer = threading.Timer(1.0, again)
     timer.daemon = True
@@ -90,7 +99,8 @@ def without_interrupts() -> Iterator[None]:
         return
     from multiprocessing.resource_tracker import ensure_running  # noqa: PLC0415
 
-    ensure_running()  # started later, it would unblock Ctrl-C
+    # Started later, it would unblock Ctrl-C.
+    ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -132,9 +142,16 @@ def child_process(
     """Start a command; end it, and all that it has started, at the end of the block.
 
     It belongs to this process's group, so that a closed terminal, say, ends both; on Linux a kill
-    of this process alone ends it as well. `folder` is its working directory and holds its temporary
-    files; `env` is its environment; `log` takes its output. Raises OSError where it cannot be
-    started.
+    of this process alone ends it as well.
+
+    Args:
+        command: its words.
+        folder: its working directory, which holds its temporary files.
+        env: its environment.
+        log: takes its output.
+
+    Raises:
+        OSError: it cannot be started.
     """
     environment = dict(os.environ if env is None else env)
     if folder is not None:
@@ -171,7 +188,8 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 LOCK = ".cosim.lock"
 HOLDER = ".cosim.lock.holder"
-_held: dict[Path, filelock.BaseFileLock] = {}
+_locks: dict[Path, filelock.BaseFileLock] = {}
+"""Locks of this process, by folder."""
 
 
 def hold(folder: Path) -> None:
@@ -183,10 +201,10 @@ def hold(folder: Path) -> None:
     import filelock  # noqa: PLC0415
 
     folder = folder.resolve()
-    if folder in _held:
+    if folder in _locks:
         return
     try:
-        _held[folder] = lock(folder / LOCK, 0).lock
+        _locks[folder] = lock(folder / LOCK, 0).lock
     except filelock.Timeout:
         who = "another process"
         with suppress(OSError, ValueError):
@@ -194,8 +212,9 @@ def hold(folder: Path) -> None:
         raise CosimError(
             f"folder '{folder}' is being written by {who}; wait for it or choose another --out"
         ) from None
-    for left in folder.glob(f"{STAGED}*"):  # by a process that was killed
-        shutil.rmtree(left, ignore_errors=True)
+    # What a process that was killed has left.
+    for staged in folder.glob(f"{STAGED}*"):
+        shutil.rmtree(staged, ignore_errors=True)
     since = datetime.now(UTC).isoformat(timespec="seconds")
     command = " ".join(["cosim", *sys.argv[1:]])
     holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
@@ -206,7 +225,7 @@ def hold(folder: Path) -> None:
 def holding(folder: Path) -> Iterator[None]:
     """Hold a folder, made if need be, during the block, as `hold` does."""
     folder.mkdir(parents=True, exist_ok=True)
-    ours = folder.resolve() not in _held
+    ours = folder.resolve() not in _locks
     hold(folder)
     try:
         yield
@@ -217,19 +236,19 @@ def holding(folder: Path) -> Iterator[None]:
 
 def release() -> list[Path]:
     """Release every lock of this process and remove its files; returns the folders."""
-    folders = list(_held)
+    folders = list(_locks)
     for folder in folders:
         _release(folder)
     return folders
 
 
 def _release(folder: Path) -> None:
-    held = _held.pop(folder)
+    lock_ = _locks.pop(folder)
     # Remove it while it is held: another process then makes another file.
     for name in (HOLDER, LOCK):
         with suppress(OSError):
             (folder / name).unlink()
-    held.release()
+    lock_.release()
 
 
 @contextmanager

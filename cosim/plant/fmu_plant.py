@@ -48,11 +48,21 @@ class FmuPlant:
     `plant.start_time` + k·h. Use it as a context manager, or call `close`. An FMU is native code:
     name only files that you trust.
 
-    `scenario` is a `Scenario` or what `Scenario.load` takes; `fmu`, a shipped one's name or a path,
-    replaces the scenario's. `intermediate` is called with time [s] and states (n,) after each
-    internal step of an FMI 3.0 FMU that provides these values. Raises PlantError if the FMU is
-    missing, corrupt, has no co-simulation binary for this platform or lacks a variable that the
-    scenario names; CapabilityError once a capability that the FMU lacks is used.
+    Args:
+        scenario: a `Scenario` or what `Scenario.load` takes.
+        fmu: a shipped one's name or a path, in place of the scenario's.
+        intermediate: is called with time [s] and states (n,) after each internal step of an FMI 3.0
+            FMU that provides these values.
+
+    Attributes:
+        units: unit of each variable of the scenario, by name.
+        state_range: least and greatest values of the states, (n,) each, as the FMU states them.
+        drivable: whether compiled code can step the FMU (`drive`).
+
+    Raises:
+        PlantError: the FMU is missing, corrupt, has no co-simulation binary for this platform or
+            lacks a variable that the scenario names.
+        CapabilityError: a capability that the FMU lacks is used.
     """
 
     def __init__(
@@ -81,15 +91,18 @@ class FmuPlant:
         ranges = np.array([archive.range(name) for name in plant.states])
         self.state_range = ranges[:, 0], ranges[:, 1]
         self.penalty = self.scenario.state_penalty
-        self._seeds, self._initial = wiring.seeds, wiring.initial
+        self._seeds = wiring.seeds
+        self._initial = wiring.initial
         self._asked = list(plant.initial_state)
         self._elsewhere = False
         self._m = len(plant.actions)
         self._k = _NOT_STARTED
-        self._started = self._saves = False
+        self._started = False
+        self._saves = False
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
-        self._wiring, self._intermediate = wiring, intermediate
+        self._wiring = wiring
+        self._intermediate = intermediate
         self._probe = probe_of(subject_of(self.scenario, archive, wiring))
         self._reading = self._probe.reading
         if plant.outputs is not None:
@@ -158,9 +171,18 @@ class FmuPlant:
         return self._copy_states()
 
     def reset(self, seed: int, initial_state: Sequence[float] | Array | None = None) -> Array:
-        """Start again at k = 0 with the disturbances of a seed in [0, 2⁶⁴); return the state (n,).
+        """Start again at k = 0; every start value is written.
 
-        `initial_state` (n,) replaces the scenario's for this episode. Every start value is written.
+        Args:
+            seed: of the disturbances, in [0, 2⁶⁴).
+            initial_state: in place of the scenario's for this episode, (n,).
+
+        Returns:
+            The state, (n,).
+
+        Raises:
+            PlantError: the FMU fails, or starts elsewhere than it was asked to.
+            CapabilityError: it cannot begin a second episode.
         """
         fmi = self._instance
         words = seed_words(seed, self._seeds)
@@ -187,9 +209,11 @@ class FmuPlant:
                 "repeat the first start, and it can be instantiated only once per process"
             )
         self._instance.close(self._handles)
-        self._handles, self._free_handles = [], []
+        self._handles = []
+        self._free_handles = []
         self._started = False
-        self._elsewhere, self._asked = False, list(self.scenario.plant.initial_state)
+        self._elsewhere = False
+        self._asked = list(self.scenario.plant.initial_state)
         self._instantiate()
         return self._instance
 
@@ -216,12 +240,15 @@ class FmuPlant:
         if self._k < 0:
             self._running()
         self._inputs[:] = values
-        penalty, k = self._penalty_now, self._k
+        penalty = self._penalty_now
+        k = self._k
+        # Until the step is done: after an error the plant needs a reset.
         self._k = _NOT_STARTED
         if self._changes and k in self._changes:
             self._changes[k]()
         self._advance(self._start_time + k * self._h)
-        states, cost = self._states[:], self._outputs[0]
+        states = self._states[:]
+        cost = self._outputs[0]
         if not isfinite(cost + sum(states)):
             self._refuse_output(k)
         self._k = k + 1
@@ -238,18 +265,31 @@ class FmuPlant:
         self._outputs[:] = outputs
 
     def drive(self, loop: CompiledLoop, table: Array) -> Array:
-        """Take the next samples in a compiled loop, a row of `table` each; return the state (n,).
+        """Let the next samples pass in a compiled loop; as many calls of `step` give the same.
 
-        As many calls of `step` give the same. Raises PlantError, then needs a reset.
+        Args:
+            loop: the controller's.
+            table: gets a row for each sample.
+
+        Returns:
+            The state, (n,).
+
+        Raises:
+            PlantError: the FMU fails; it then needs a reset.
         """
         fmi = self._running()
-        k, first, end = self._k, self._k, self._k + len(table)
+        first = self._k
+        end = first + len(table)
+        k = first
         self._k = _NOT_STARTED
         while k < end:
             if k in self._changes:
                 self._changes[k]()
-            stop = min((change for change in self._changes if change > k), default=end)
-            stop = min(stop, end)
+            # Up to the next change of the plant's parameters.
+            stop = end
+            for change in self._changes:
+                if k < change < stop:
+                    stop = change
             k, fault, status = loop(fmi.native, k, table[k - first : stop - first])
             if fault == NOT_FINITE:
                 self._refuse_output(k)
@@ -321,12 +361,18 @@ class FmuPlant:
         """Memory of a dropped snapshot, or a null handle, which the FMU allocates."""
         fmi.no_return.value = False
         if not self._free_handles:
-            self._handles.append(handle := ctypes.c_void_p())
+            handle = ctypes.c_void_p()
+            self._handles.append(handle)
             return handle
         return self._free_handles.pop()
 
     def recycle(self, instance: Instance, handle: ctypes.c_void_p) -> None:
-        """Keep a dropped snapshot's memory for the next one; each snapshot calls this."""
+        """Keep a dropped snapshot's memory for the next one; each snapshot calls this.
+
+        Args:
+            instance: of which it is.
+            handle: the memory.
+        """
         if instance is self._fmi:
             self._free_handles.append(handle)
             instance.no_return.value = len(self._free_handles) == len(self._handles)
@@ -335,7 +381,8 @@ class FmuPlant:
         """Free the FMU instance and every snapshot; a closed plant refuses all calls."""
         if self._fmi is None:
             return
-        fmi, self._fmi = self._fmi, None
+        fmi = self._fmi
+        self._fmi = None
         self._k = _NOT_STARTED
         fmi.close(self._handles)
 
@@ -386,5 +433,5 @@ class FmuPlant:
         table = self.scenario.plant
         values = {table.stage_cost: self._outputs[0]}
         values |= dict(zip(table.states, self._states, strict=True))
-        bad = ", ".join(f"{name} = {value}" for name, value in values.items() if value - value != 0)
+        bad = ", ".join(f"{name} = {x}" for name, x in values.items() if not isfinite(x))
         raise PlantError(f"FMU '{self.fmu_path.name}' returned {bad} at step {k}")

@@ -140,6 +140,7 @@ def _measure_all(
     total = len(named) * noise.samples
     with reporting(progress, scenario.name, total) as report:
         for key, result in done(items, jobs, scheduler):
+            # A mean over fewer seeds would be another figure under the same name.
             if isinstance(result, Failure):
                 raise result.error()
             name = key[0]
@@ -521,6 +522,7 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
     _check_seeds_and_lengths(runs)
     optimum_name = stored_optimum(scenario)
     optimum = None if optimum_name is None else build_controller(optimum_name, scenario)
+    # Runs that were played back, by what the plant did.
     played: dict[bytes, Path] = {}
     plant_table = scenario.plant
     names = (
@@ -591,6 +593,7 @@ def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
     except (OSError, ValueError, KeyError, TypeError, OverflowError, Warning) as error:
         reason = " ".join(str(error).split())
         raise EvaluationError(f"'{path}' is no trajectory: {reason}") from None
+    # A simulation would clip them, and judge another run than the file's.
     actions = numbers[list(plant.actions)].to_numpy()
     inside = (actions >= scenario.action_lower) & (actions <= scenario.action_upper)
     if not len(actions) or not inside.all():

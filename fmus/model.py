@@ -238,6 +238,7 @@ def closure(name: str, model: FmuModel) -> frozenset[str]:
         model: the table that it is in.
     """
     names: set[str] = set()
+    # A state is known at every instant; what it depends on acts through its derivative.
     for used in model.by_name[name].uses:
         names.add(used)
         if model.by_name[used].kind in (Kind.OUTPUT, Kind.DERIVATIVE):

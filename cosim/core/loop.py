@@ -108,9 +108,11 @@ class ClosedLoop:
             CosimError: the controller gave what is no solution.
         """
         begin = middle = perf_counter()
+        # The two phases are timed apart: only feedback delays the action.
         try:
             if prepare:
                 self._controller.prepare()
+                # Now: a feedback of several QPs linearises elsewhere.
                 if self._keeps_points:
                     self.point = self._controller.linearisation_point  # type: ignore[attr-defined]
                 middle = perf_counter()
@@ -141,6 +143,7 @@ class ClosedLoop:
         if self.solution is None:
             return self.applied
         action = self.solution.action
+        # NumPy would spread a number over all inputs, and take truth for one.
         if not isinstance(action, np.ndarray) or action.dtype.kind not in "fiu":
             given = f"{type(action).__name__} {action}"
         elif action.shape != self.lower.shape:

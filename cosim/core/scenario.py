@@ -243,6 +243,7 @@ class Penalty:
         total = 0.0
         for i, lower, upper, linear, quadratic in self._rows:
             x = state[i]
+            # The common case first; a NaN goes on and makes the total one.
             if lower <= x <= upper:
                 continue
             v = lower - x if x < lower else x - upper
@@ -351,6 +352,7 @@ class Scenario(Shown, Table):
     def _check_bounds(self) -> None:
         """Raise ValueError where a lower bound is not below the upper one."""
         for name, (lower, upper) in self.limits.items():
+            # Written so that no number is refused, too.
             if not lower < upper:
                 kind = "state" if name in self.plant.states else "action"
                 raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper for '{name}'")
@@ -358,6 +360,7 @@ class Scenario(Shown, Table):
     def _check_times(self) -> None:
         """Raise ValueError where steps, start and stop, or the changes do not fit."""
         plant = self.plant
+        # Within rounding: 0.3 s in steps of 0.1 s are 2.9999999999999996.
         steps = self.sampling_time / (plant.communication_step or self.sampling_time)
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
             raise ValueError("plant.communication_step: must be a divisor of sampling_time")
@@ -419,6 +422,7 @@ class Scenario(Shown, Table):
         """
         document = self.to_dict()
         plant = document["plant"]
+        # In the order of their times, so that a later one replaces an earlier one.
         for change in plant.pop("changes", ()):
             if change["time"] <= time:
                 plant["parameters"] |= change["parameters"]
@@ -445,6 +449,7 @@ class Scenario(Shown, Table):
         del document["name"]
         del document["description"]
         document["plant"]["fmu"] = Path(self.plant.fmu).name
+        # One text for one content, whatever the order of a file's keys.
         canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -620,6 +625,7 @@ def resolved(
     Raises:
         ScenarioError: what it extends is no scenario, or leads back to it.
     """
+    # Nothing is validated yet: any value may be of any kind.
     result = copy.deepcopy(dict(document))
     plant = result.get("plant")
     if isinstance(plant, dict):
@@ -633,9 +639,11 @@ def resolved(
         raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
     if base not in presets() and not RANDOM.fullmatch(base):
         base = str(folder / base)
+    # The system's calls take no such path.
     if "\0" in base:
         raise ScenarioError(f"{origin}: extends must not hold a null byte")
     if str(Path(base).resolve()) in seen:
         raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
+    # Depth first: the base has been resolved as seen from its own folder.
     base_document, _ = read(base, seen)
     return merged(base_document, result)

@@ -70,6 +70,7 @@ def simulate(
         RunEndedError: the plant failed in mid run; its `trajectory` has the samples before.
     """
     steps = whole_number("steps", steps, 1, CosimError)
+    # The columns are there before the recorder opens its file: they may not fit the memory.
     run = _Run(plant, controller, steps, seed, residuals)
     if recorder is not None:
         recorder.start(plant.scenario, controller, seed, steps, plant.units)
@@ -85,6 +86,7 @@ def simulate(
                 with closing(recorder):
                     run.interpreted(recorder.record, report)
     except PlantError as error:
+        # Of a plant that fails at once there is nothing to show.
         if run.done == 0:
             raise
         ended = RunEndedError(f"{error}; the run ended after {run.done} of {steps} samples")
@@ -206,6 +208,7 @@ class _Run:
             return
         first = self.done
         count = len(rows)
+        # One conversion for a part, not one for each row.
         columns = self._fill(first, np.array(rows))
         rows.clear()
         if record is None:
@@ -224,6 +227,7 @@ class _Run:
         """
         plant: Any = self._plant
         plant.reset(spawn_seeds(self._seed)[0])
+        # In parts, so that progress is shown and Ctrl-C is heard.
         for first in range(0, self._steps, PART):
             end = min(first + PART, self._steps)
             table = np.full((end - first, self._ends[-1]), nan)
@@ -249,12 +253,15 @@ class _Run:
         end = first + len(table)
         self.done = end
         stored = {name: column[first:end] for name, column in self._columns.items()}
+        # k·h, never a sum of h.
         stored["time"][:] = np.arange(first, end) * self._scenario.sampling_time
         parts = np.split(table, self._ends[:-1], axis=1)
         for name, part in zip(MEASURED, parts, strict=True):
             stored[name][:] = part.reshape(stored[name].shape)
+        # A compiled loop has them at no cost; the interpreted one does not ask for them.
         if not self._residuals:
             stored["residual"][:] = nan
+        # In the order of their declaration: one may need another.
         for kind in SIGNALS:
             if kind.derive is not None:
                 stored[kind.name][:] = kind.derive(self._scenario, stored)
@@ -263,6 +270,7 @@ class _Run:
     def _number(self, solution: Solution, name: str) -> float:
         """A field of a solution that is a number; raises CosimError where it is none."""
         value = getattr(solution, name, None)
+        # Of our own controllers always, and a short way for every sample.
         if type(value) is float:
             return value
         numbers = int | float | np.integer | np.floating
@@ -417,6 +425,7 @@ def reporting(
         read: turns what the callback is called with into the number done and a remark.
     """
     if callable(progress) or not progress:
+        # Whoever reports need not know whether anybody listens.
         yield progress or (lambda *news: None)
         return
     from rich import progress as rich_progress  # noqa: PLC0415, only where a bar is drawn

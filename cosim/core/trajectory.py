@@ -165,6 +165,7 @@ class Trajectory(Result):
                 missing += [name for name in names if name not in self.signals]
         if missing:
             raise TrajectoryError(f"the trajectory lacks the signal {', '.join(missing)}")
+        # All are of one length: a figure or a mean would else pair unlike samples.
         samples = len(self.status)
         for signal in self.signals.values():
             if signal.values.shape != (samples,):
@@ -259,10 +260,11 @@ class Trajectory(Result):
 
     def timing_summary(self) -> dict[str, dict[str, float]]:
         """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
+        shares = list(QUANTILES.values())
         summary = {}
-        for name, seconds in self.timing.items():
-            quantiles = 1e6 * np.quantile(seconds, list(QUANTILES.values()))
-            summary[name] = dict(zip(QUANTILES, quantiles.tolist(), strict=True))
+        for phase, seconds in self.timing.items():
+            quantiles = 1e6 * np.quantile(seconds, shares)
+            summary[phase] = dict(zip(QUANTILES, quantiles.tolist(), strict=True))
         return summary
 
     def to_csv(self) -> str:
@@ -277,7 +279,8 @@ class Trajectory(Result):
         """Write the wall-clock times in µs to a file, apart from what must repeat to the bit."""
         header = [f"{name} [us]" for name in self.timing]
         rows = _rows(list(self.timing.values()))
-        return _write(path, header, ([f"{1e6 * value:.3f}" for value in row] for row in rows))
+        texts = ([f"{1e6 * value:.3f}" for value in row] for row in rows)
+        return _write(path, header, texts)
 
     def _table(self) -> tuple[list[str], Iterator[list[str]]]:
         """Header and rows of the CSV."""
@@ -343,6 +346,7 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
             rows = list(csv.reader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
         raise TrajectoryError(f"'{path}' cannot be read: {cause}") from None
+    # Another table, or a file that was cut after its header.
     if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
     header = rows[0]
@@ -359,6 +363,7 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
     signals: dict[str, Signal] = {}
     for title, column in zip(header, values.T, strict=False):
         name, _, unit = title.partition(" [")
+        # The later one would replace the first without a word.
         if name in signals:
             raise TrajectoryError(f"'{path}' has two columns '{name}'")
         signals[name] = Signal(name, unit.removesuffix("]"), column.copy())

@@ -22,7 +22,7 @@ from fmus.check import information, problems_of
 
 SAMPLES = 20
 """Steps of the run with the start values held."""
-SHOWN = 5
+NAMES_SHOWN = 5
 """Names of a row at most."""
 
 
@@ -96,6 +96,7 @@ def check_plant(
     """
     path = (fmus.path(str(fmu)) if str(fmu) in SHIPPED else Path(fmu)).absolute()
     _require_fmu(path)
+    # From here on an FMU that cannot be a plant is an answer, and no error.
     try:
         archive = unpack(path)
     except PlantError as error:
@@ -189,6 +190,7 @@ def _document(
         is_output = variable.causality == "output" and variable.type in REALS
         if is_output and not variable.shape and name not in (*roles.states, roles.stage_cost):
             others.append(name)
+    # So the probe says of every output where it belongs.
     document["plant"]["disturbances"] = others
     document["plant"]["mapping"] = {}
     document["disturbance"] = {"law": "none"}
@@ -197,8 +199,8 @@ def _document(
 
 
 def _some(names: Sequence[str]) -> str:
-    more = f" … ({len(names)} in all)" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+    more = f" … ({len(names)} in all)" if len(names) > NAMES_SHOWN else ""
+    return ", ".join(names[:NAMES_SHOWN]) + more
 
 
 def _step_size(archive: UnpackedFmu, step: float) -> Row:
@@ -248,7 +250,7 @@ def _run_row(scenario: Scenario) -> Row:
         action = scenario.saturate(scenario.reference_action)
         for _ in range(SAMPLES):
             state = plant.step(action).s
-    shown = ", ".join(f"{value:.4g}" for value in state[:SHOWN])
+    shown = ", ".join(f"{value:.4g}" for value in state[:NAMES_SHOWN])
     return Row("run", f"{SAMPLES} steps, all numbers finite", f"then the states are {shown}")
 
 

@@ -33,7 +33,7 @@ HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
 COSTS = ("cost", "loss", "objective")
-SHOWN = 12
+INPUTS_SHOWN = 12
 """Inputs that a remark names at most."""
 
 
@@ -308,8 +308,8 @@ def _actions_remark(report: Report, archive: UnpackedFmu) -> str:
 def _inputs_remark(report: Report) -> str:
     """Which inputs nobody drives."""
     pairs = [f"{name} = {start or '?'}" for name, start in report.undriven.items()]
-    more = f" and {len(pairs) - SHOWN} more" if len(pairs) > SHOWN else ""
-    inputs = ", ".join(pairs[:SHOWN]) + more
+    more = f" and {len(pairs) - INPUTS_SHOWN} more" if len(pairs) > INPUTS_SHOWN else ""
+    inputs = ", ".join(pairs[:INPUTS_SHOWN]) + more
     return f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
 
 
@@ -423,9 +423,10 @@ def _remarks(
         "controller": "the undisturbed plant's steady state nearest to its start values; "
         "`cosim tuning` prints the cheapest one",
     }
-    free = [name for name in plant["states"] if not any(map(isfinite, fmu.range(name)))]
-    if free:
-        remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(free)}"
+    # A state may well have one bound alone; an action is sampled between two.
+    unbounded = [name for name in plant["states"] if not any(map(isfinite, fmu.range(name)))]
+    if unbounded:
+        remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(unbounded)}"
     open_ended = [name for name in plant["actions"] if not all(map(isfinite, fmu.range(name)))]
     if open_ended:
         remarks["bounds.action_lower"] = (
@@ -448,6 +449,7 @@ def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
         text: TOML.
         remarks: by dotted name; one on a key that the text does not have stands above its table.
     """
+    # Dotted name of the key or table of each line.
     names = []
     table = ""
     for line in text.splitlines():
@@ -469,14 +471,16 @@ def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
 
 
 def _reals(fmu: UnpackedFmu, causality: str) -> list[str]:
-    return [
-        name
-        for name, variable in fmu.variables.items()
-        if variable.causality == causality and variable.type in REALS and not variable.shape
-    ]
+    """Names of the scalar reals of a causality."""
+    names = []
+    for name, variable in fmu.variables.items():
+        if variable.causality == causality and variable.type in REALS and not variable.shape:
+            names.append(name)
+    return names
 
 
 def _cost(fmu: UnpackedFmu) -> str:
+    """The one output that is called a cost."""
     outputs = _reals(fmu, "output")
     if not outputs:
         raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output to draft from")
@@ -496,10 +500,13 @@ def _is_cost(name: str) -> bool:
 
 def _states(fmu: UnpackedFmu, others: Sequence[str]) -> list[str]:
     """Continuous states, else outputs with a start parameter."""
-    rates = [v for v in fmu.variables.values() if getattr(v, "derivative", None) is not None]
-    if rates:
-        names = [name for rate in rates for name in elements(rate.derivative)]
-        return list(dict.fromkeys(names))
+    # FMI marks the rate of a continuous state, which names it.
+    continuous = []
+    for variable in fmu.variables.values():
+        if getattr(variable, "derivative", None) is not None:
+            continuous += elements(variable.derivative)
+    if continuous:
+        return list(dict.fromkeys(continuous))
     outputs = [name for name in _reals(fmu, "output") if name not in others]
     started = [name for name in outputs if any(candidates(fmu, name))]
     if started:
@@ -556,6 +563,7 @@ def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
     if codes and is_parameter("law", ("Enumeration",)):
         table["law"] = "law"
         table["law_codes"] = codes
+    # Means and ranges of all disturbances, or of none: a scenario has an entry for each.
     for field, suffix in (("nominal", "_nominal"), ("ranges", "_range")):
         parameters = [f"{name}{suffix}" for name in noise]
         if parameters and all(is_parameter(name, REALS) for name in parameters):

@@ -439,10 +439,19 @@ class Native(ctypes.Structure):
 
     _fields_: ClassVar[list[tuple[str, Any]]] = [
         ("version", ctypes.c_int),
-        *((name, ctypes.c_void_p) for name in ("set", "get", "step", "component")),
-        *((name, ctypes.c_void_p) for name in ("inputs", "outputs", "states")),
-        *((name, ctypes.c_size_t) for name in ("n_inputs", "n_outputs", "n_states")),
-        *((name, ctypes.c_void_p) for name in ("input", "output", "state")),
+        ("set", ctypes.c_void_p),
+        ("get", ctypes.c_void_p),
+        ("step", ctypes.c_void_p),
+        ("component", ctypes.c_void_p),
+        ("inputs", ctypes.c_void_p),
+        ("outputs", ctypes.c_void_p),
+        ("states", ctypes.c_void_p),
+        ("n_inputs", ctypes.c_size_t),
+        ("n_outputs", ctypes.c_size_t),
+        ("n_states", ctypes.c_size_t),
+        ("input", ctypes.c_void_p),
+        ("output", ctypes.c_void_p),
+        ("state", ctypes.c_void_p),
         ("start_time", ctypes.c_double),
         ("step_size", ctypes.c_double),
         ("order", ctypes.c_int),
@@ -587,14 +596,23 @@ class Instance(ABC):
         self._first, self._second, self._third = self._calls_of_a_step(reading)
         self._to_start = self._calls_to_start()
         self._start_places = [place for place, _ in starts]
-        structural = [(place, value) for place, value in starts if place.structural]
+        # Sizes of arrays come first, in a mode of their own (FMI 3.0).
+        structure_places: list[Place] = []
+        structure_values: list[float] = []
+        places: list[Place] = []
+        values: list[float] = []
+        for place, value in starts:
+            if place.structural:
+                structure_places.append(place)
+                structure_values.append(value)
+            else:
+                places.append(place)
+                values.append(value)
         self._set_structure: Callable[[], None] | None = None
-        if structural:
-            self._set_structure = self.writer(*zip(*structural, strict=True))
-        plain = [(place, value) for place, value in starts if not place.structural]
-        places = [place for place, _ in plain]
+        if structure_places:
+            self._set_structure = self.writer(structure_places, structure_values)
         self._starts, self._set_starts = self._exchange(places, "Set")
-        self._starts[:] = [value for _, value in plain]
+        self._starts[:] = values
         # FMI 2 counts value references anew for each type.
         self._start_of = {place[:3]: i for i, place in enumerate(places)}
 
@@ -1039,7 +1057,9 @@ class Fmi3Instance(Instance):
 
     @cached_property
     def _step_arguments(self) -> tuple[Any, ...]:
-        event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
+        event = ctypes.c_bool()
+        self._terminate = ctypes.c_bool()
+        self._early = ctypes.c_bool()
         # Infinite where an FMU does not say how far it came.
         self._last_time = ctypes.c_double(inf)
         self.no_return = ctypes.c_bool(self.no_return.value)

@@ -78,6 +78,7 @@ class FmuPlant:
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
         self._h = self.scenario.sampling_time
         step = self.scenario.plant.communication_step or self._h
+        # The first reason suffices: the others may follow from it.
         for refusal in refusals(archive, step):
             raise PlantError(refusal)
         wiring = Wiring(self.scenario, archive)
@@ -103,10 +104,12 @@ class FmuPlant:
         self._steps = round(self._h / step)
         self._wiring = wiring
         self._intermediate = intermediate
+        # What the FMU was seen to do decides, not what its description says.
         self._probe = probe_of(subject_of(self.scenario, archive, wiring))
         self._reading = self._probe.reading
         if plant.outputs is not None:
             self._reading = self._probe.stated(plant.outputs)
+        # A scenario with a model of its plant is for comparisons with the optimum.
         if plant.model is not None:
             self.require_cost_of_sample()
         if self._probe.misfit:
@@ -185,6 +188,7 @@ class FmuPlant:
             CapabilityError: it cannot begin a second episode.
         """
         fmi = self._instance
+        # Before anything changes: a wrong seed leaves the plant as it is.
         words = seed_words(seed, self._seeds)
         if self._started and not self._resets:
             fmi = self._begin_anew()
@@ -229,6 +233,7 @@ class FmuPlant:
 
     def step(self, a: Sequence[float] | Array) -> Step:
         """Hold the action a (m,) for one sampling time; raises PlantError, then needs a reset."""
+        # A sum is finite where each of its terms is: one call for all of them.
         try:
             values = a.tolist() if isinstance(a, np.ndarray) else list(a)
             acceptable = len(values) == self._m and isfinite(sum(values))
@@ -259,6 +264,7 @@ class FmuPlant:
         """Step through a sample; the outputs are those of its first step."""
         fmi = self._instance
         fmi.advance(time)
+        # Stage cost and disturbance are those of the sample's begin.
         outputs = self._outputs[:]
         for i in range(1, self._steps):
             fmi.advance(time + i * self._h / self._steps)
@@ -302,6 +308,7 @@ class FmuPlant:
     def snapshot(self) -> Snapshot:
         """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""
         fmi = self._running()
+        # The proof takes some steps of another instance: once a plant.
         if not self._saves:
             fmi.require_state()
             self._require_proof(self._probe.snapshots, "save and restore")
@@ -330,11 +337,13 @@ class FmuPlant:
         fmi = self._instance
         if len(data) < _HEADER.size:
             raise PlantError("these bytes are not a serialised plant state")
+        # Another build of the same model may lay out its memory otherwise.
         k, digest = _HEADER.unpack_from(data)
         if digest.hex() != self.fmu_sha256:
             raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
         fmi.require_serialised_state()
         self._require_proof(self._probe.serialises, "serialise")
+        # So that every later call finds an initialised instance.
         if not self._started:
             self.reset(0)
         handle = self._handle(fmi)

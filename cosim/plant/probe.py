@@ -557,6 +557,7 @@ class Probe:
     def _examine(self, bench: _Bench, first: ProbedRun, experiment: Experiment) -> Findings:
         """What the runs after a first one show; the first failure ends it."""
         seen = self._nothing_known(experiment)
+        # A reset must repeat the first run to the bit, before any other run relies on it.
         try:
             bench.resets = _same(bench.run(self._inputs, by_reset=True), first)
         except PlantError as error:
@@ -568,9 +569,11 @@ class Probe:
             else:
                 second = bench.run(self._inputs, by_reset=False)
                 starts_alike = second.outputs == first.outputs
+                # Noise that no seed holds: runs that differ in one thing say nothing.
                 if not _same(second.samples, first.samples):
                     line = "two new instances under the same actions give different numbers"
                     return seen._replace(failure=seen.failure or line)
+            # FMI forbids it: an FMU may answer, and go on otherwise than it would have.
             looked = bench.run(self._inputs, look=True).samples
             seen = seen._replace(harmless=_same(looked, first.samples))
             kinds = self._kinds(bench, first, looked if seen.harmless else (), starts_alike)
@@ -588,6 +591,7 @@ class Probe:
         latter; one that goes by a step of its own, whatever it is told, neither.
         """
         half = self.subject.step / 2
+        # An FMU that refuses half a step knows how long a step is.
         try:
             halves = bench.run(self._inputs[:1] * 2, sizes=[half, half], spacing=half).samples
         except PlantError:
@@ -662,6 +666,8 @@ class Probe:
     def reading(self) -> Reading:
         """The order of a step's calls that gives each output where it belongs."""
         kinds = self.findings.kinds
+        # What follows the actions needs a get between set and step, what is of state or time one
+        # before both; the late ones are read once more after the step.
         if Kind.FOLLOWS in kinds:
             order = Order.SET_GET_STEP
         elif Kind.INSTANT in kinds:
@@ -708,6 +714,7 @@ class Probe:
         """Why the FMU cannot be the plant as asked; empty if it can."""
         findings = self.findings
         name = f"FMU '{self.subject.fmu.path.name}'"
+        # The first of them: others may follow from it.
         for start, asked, value in findings.misset:
             return (
                 f"{name} was given {start} = {asked:g} and has {value:g} after its initialisation"
@@ -752,6 +759,7 @@ class Probe:
         """Save after the first sample; the states then, and what followed."""
         fmi = bench.start()
         fmi.require_state()
+        # From here on it may be taken back.
         fmi.no_return.value = False
         bench.go_on(fmi, self._inputs[:1])
         states = tuple(fmi.states)
@@ -759,6 +767,7 @@ class Probe:
         return fmi, states, bench.go_on(fmi, self._inputs[1:], first=1)
 
     def _try_snapshot(self, bench: _Bench) -> str:
+        # What the same steps give where nothing is saved.
         without = bench.run(self._inputs)
         fmi, states, samples = self._saved(bench)
         if not _same(samples, without.samples[1:]):
@@ -786,13 +795,15 @@ class Probe:
         bench = _Bench(self.subject, self.findings.experiment)
         try:
             bench.instantiate()
+            # All actions low, then one of them high.
             rest = bench.run(self._other_inputs).samples
             names = {}
             for i, name in enumerate(self.subject.names[0]):
                 moved = list(self._low)
                 moved[i] = self._high[i]
                 samples = bench.run([tuple(moved)] * len(rest)).samples
-                if [sample.states for sample in samples] == [sample.states for sample in rest]:
+                states = [sample.states for sample in samples]
+                if states == [sample.states for sample in rest]:
                     names[name] = not _same(samples, rest)
             return names
         except PlantError:
@@ -802,10 +813,12 @@ class Probe:
 
 
 _probes: dict[tuple[Any, ...], Probe] = {}
+"""Probes of this process by what their findings hold for."""
 
 
 def probe_of(subject: Subject) -> Probe:
     """The one probe of a subject in this process."""
+    # To try an FMU takes a dozen short runs; a study makes hundreds of plants of it.
     key = subject.key
     if key not in _probes:
         _probes[key] = Probe(subject)
@@ -842,10 +855,11 @@ def probe(
     else:
         fmu = unpack(plant)
         subject = bare_subject(fmu, actions, outputs, states, step)
-        starts_anywhere = all(
-            has_start(fmu.variable(name)) or f"{name}_start" in fmu.variables
-            for name in subject.names[2]
-        )
+        # By name alone: `start_parameters` proves it, and needs a scenario.
+        starts_anywhere = True
+        for name in subject.names[2]:
+            if not has_start(fmu.variable(name)) and f"{name}_start" not in fmu.variables:
+                starts_anywhere = False
     return _report(probe_of(subject), starts_anywhere)
 
 

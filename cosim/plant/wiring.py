@@ -109,6 +109,7 @@ def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
         return Experiment(start, None, tolerance)
     if plant.start_time is not None:
         start = plant.start_time
+    # Only here both are known: either may be the file's.
     if plant.stop_time is not None and plant.stop_time <= start:
         raise PlantError(
             f"plant.stop_time of {plant.stop_time:g} s is not after the start time of {start:g} s, "
@@ -230,6 +231,7 @@ class Wiring:
             )
         shape = self._shape(variable)
         index = 0
+        # The kind first: of a wrong variable no element helps.
         fault = misfit(variable)
         if shape and not fault:
             brackets = name.removeprefix(variable.name)
@@ -275,6 +277,7 @@ class Wiring:
 
     def _shape(self, variable: Any) -> tuple[int, ...]:
         """Shape of a variable, by the structural parameters as the scenario sets them."""
+        # FMI 3.0: a dimension may be a parameter, which the scenario may set.
         parameters = self._scenario.plant.parameters
         shape = []
         for dimension in variable.dimensions:

@@ -141,7 +141,7 @@ def build(
     with output(json) as out_:
         from fmus import BuildError
         from fmus.build import build_folder
-        from fmus.evaporator import build as build_fmus
+        from fmus.evaporator import build_evaporator as build_fmus
         from fmus.evaporator import build_in_place, compare_with_shipped
 
         every = platforms == "all"

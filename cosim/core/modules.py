@@ -33,7 +33,7 @@ UNKNOWN = "cannot be known"
 _folders: list[str] = []
 _loaded: dict[Path, str] = {}
 """Hash of the sources at each place from which a user's module was loaded, as of that time."""
-_lock = threading.RLock()
+_import_lock = threading.RLock()
 
 
 def import_from(folder: str | Path) -> None:
@@ -60,7 +60,7 @@ def importing() -> Iterator[None]:
     No bytecode is written meanwhile: Python takes it for current where the source has the same
     size and was changed in the same second, and would run the code from before an edit.
     """
-    with _lock:
+    with _import_lock:
         written = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         added = [folder for folder in import_folders() if folder not in sys.path]

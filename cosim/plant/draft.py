@@ -21,7 +21,7 @@ from cosim.core.scenario import Scenario
 from cosim.core.validation import suggestion
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.probe import AFTER, Kind, Report, Restart, probe
+from cosim.plant.probe import AFTER, OutputKind, Report, Restart, probe
 from cosim.plant.starts import candidates, start_parameters
 from cosim.plant.wiring import INTEGERS, NO_NUMBERS, REALS, refusals
 
@@ -315,7 +315,7 @@ def _inputs_remark(report: Report) -> str:
 
 def _outputs_remark(report: Report) -> str:
     """What is known of the outputs that doStep computes."""
-    ends = [name for name, kind in report.kinds.items() if kind is Kind.END]
+    ends = [name for name, kind in report.kinds.items() if kind is OutputKind.END]
     if not ends:
         return "doStep computes the outputs: they are read after it"
     return (

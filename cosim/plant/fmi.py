@@ -135,7 +135,7 @@ def number(stated: str | float | None, otherwise: float) -> float:
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
-_lock = threading.Lock()
+_unpack_lock = threading.Lock()
 
 
 def unpack(fmu: str | Path) -> UnpackedFmu:
@@ -158,7 +158,7 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
         why = getattr(error, "strerror", None) or error
         raise PlantError(f"FMU '{path}' cannot be read: {why}") from None
     key = (path, status.st_mtime_ns, status.st_size)
-    with _lock:
+    with _unpack_lock:
         if key not in _unpacked or not _unpacked[key].folder.is_dir():
             _unpacked[key] = _unpack(path)
         return _unpacked[key]

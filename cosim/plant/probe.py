@@ -33,7 +33,7 @@ from cosim.plant.fmi import (
 from cosim.plant.wiring import REALS, Wiring, experiment, has_start, interface
 
 
-class Kind(Enum):
+class OutputKind(Enum):
     """Where the numbers of an output belong, and what shows it."""
 
     FOLLOWS = "follows the actions at once"
@@ -48,8 +48,8 @@ class Kind(Enum):
     OPEN = "cannot be told"
 
 
-BEFORE = (Kind.FOLLOWS, Kind.INSTANT)
-AFTER = (Kind.SAMPLE, Kind.END)
+BEFORE = (OutputKind.FOLLOWS, OutputKind.INSTANT)
+AFTER = (OutputKind.SAMPLE, OutputKind.END)
 
 
 class Restart(Enum):
@@ -90,7 +90,7 @@ class Report:
     sha256: str
     rows: tuple[Row, ...]
     outputs: str | None
-    kinds: dict[str, Kind]
+    kinds: dict[str, OutputKind]
     restart: Restart
     snapshots: bool
     serialises: bool
@@ -445,7 +445,7 @@ class Point(NamedTuple):
         return not jumps
 
 
-def _kind_of(i: int, points: Sequence[Point], acts: bool, starts_alike: bool) -> Kind:
+def _kind_of(i: int, points: Sequence[Point], acts: bool, starts_alike: bool) -> OutputKind:
     """Where output i belongs, of one that changes and does not follow a set.
 
     `acts` says that it depends on the action of the same step, `starts_alike` that its value after
@@ -455,14 +455,14 @@ def _kind_of(i: int, points: Sequence[Point], acts: bool, starts_alike: bool) ->
         # It depends on how long the step was: it belongs to the end, or is continuous in time.
         continuous = {point.is_continuous(i) for point in points} - {None}
         if continuous == {True} and starts_alike:
-            return Kind.INSTANT
-        return Kind.END
+            return OutputKind.INSTANT
+        return OutputKind.END
     for point in points:
         # The step moved the state, and the output is another one after it, or by the action.
         changed = point.after.outputs[i] != point.before.outputs[i]
         if point.moves() and (changed or (acts and point.k == 0)):
-            return Kind.SAMPLE
-    return Kind.OPEN
+            return OutputKind.SAMPLE
+    return OutputKind.OPEN
 
 
 class Findings(NamedTuple):
@@ -480,7 +480,7 @@ class Findings(NamedTuple):
 
     experiment: Experiment
     restart: Restart
-    kinds: tuple[Kind, ...]
+    kinds: tuple[OutputKind, ...]
     harmless: bool | None
     misset: tuple[tuple[str, float, float], ...]
     keeps_to_step: bool
@@ -496,7 +496,7 @@ class Probe:
 
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
-        self._open = (Kind.OPEN,) * len(subject.names[1])
+        self._open = (OutputKind.OPEN,) * len(subject.names[1])
         self._vary_inputs(1.0)
 
     def _vary_inputs(self, share: float) -> None:
@@ -611,7 +611,7 @@ class Probe:
 
     def _kinds(
         self, bench: _Bench, first: ProbedRun, looked: Sequence[ProbedStep], starts_alike: bool
-    ) -> tuple[Kind, ...]:
+    ) -> tuple[OutputKind, ...]:
         """Where each output belongs, by runs that differ in one thing.
 
         `looked` are the samples of `first` with a look after each set, if that is harmless.
@@ -635,11 +635,11 @@ class Probe:
             values = {sample.outputs[i] for sample in first.samples}
             changes = values != {first.outputs[i]}
             if place in self.subject.exchanged[2]:
-                kinds.append(Kind.INSTANT)
+                kinds.append(OutputKind.INSTANT)
             elif follows[i]:
-                kinds.append(Kind.FOLLOWS)
+                kinds.append(OutputKind.FOLLOWS)
             elif not (acts or changes):
-                kinds.append(Kind.CONSTANT)
+                kinds.append(OutputKind.CONSTANT)
             else:
                 kinds.append(_kind_of(i, known_points, acts, starts_alike))
         return tuple(kinds)
@@ -668,13 +668,13 @@ class Probe:
         kinds = self.findings.kinds
         # What follows the actions needs a get between set and step, what is of state or time one
         # before both; the late ones are read once more after the step.
-        if Kind.FOLLOWS in kinds:
+        if OutputKind.FOLLOWS in kinds:
             order = Order.SET_GET_STEP
-        elif Kind.INSTANT in kinds:
+        elif OutputKind.INSTANT in kinds:
             order = Order.GET_SET_STEP
         else:
             return Reading(Order.SET_STEP_GET)
-        late = tuple(i for i, kind in enumerate(kinds) if kind in (*AFTER, Kind.OPEN))
+        late = tuple(i for i, kind in enumerate(kinds) if kind in (*AFTER, OutputKind.OPEN))
         return Reading(order, late)
 
     @property
@@ -705,7 +705,7 @@ class Probe:
         if outputs == "after-step":
             return Reading(Order.SET_STEP_GET)
         # Outputs that no action moves at once need no set before them, which FMI forbids.
-        if Kind.INSTANT in kinds and Kind.FOLLOWS not in kinds:
+        if OutputKind.INSTANT in kinds and OutputKind.FOLLOWS not in kinds:
             return Reading(Order.GET_SET_STEP)
         return Reading(Order.SET_GET_STEP)
 
@@ -733,7 +733,7 @@ class Probe:
     @property
     def cost_of_sample(self) -> bool:
         """Whether the stage cost is that of the sample's begin, ℓ(x_k, u_k, d_k), or may be."""
-        return self.findings.kinds[0] is not Kind.END
+        return self.findings.kinds[0] is not OutputKind.END
 
     @cached_property
     def snapshots(self) -> str:
@@ -925,14 +925,14 @@ def _report(seen: Probe, starts_anywhere: bool) -> Report:
     )
 
 
-def _outputs_row(seen: Probe, kinds: dict[str, Kind]) -> Row:
+def _outputs_row(seen: Probe, kinds: dict[str, OutputKind]) -> Row:
     said = "; ".join(f"{name} {kind.value}" for name, kind in kinds.items())
     if seen.outputs is None:
         return Row("outputs", said, "each is read where it belongs; leave plant.outputs out")
     order = f'plant.outputs = "{seen.outputs}"'
     if not set(kinds.values()) & {*BEFORE, *AFTER}:
         order += ", the order that FMI allows, without proof"
-    if Kind.END in kinds.values():
+    if OutputKind.END in kinds.values():
         order += "; figures that need the cost at the sample's begin are refused"
     return Row("outputs", said, order)
 

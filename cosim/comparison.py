@@ -245,7 +245,11 @@ def _tolerance_of_size(signal: Signal, relative: float) -> float:
     return float(relative * np.abs(finite).max(initial=0.0))
 
 
-def _difference(a: Signal, b: Signal, tolerance: float | None) -> Difference:
+def _difference(
+    a: Signal,
+    b: Signal,
+    tolerance: float | None,
+) -> Difference:
     count = min(len(a.values), len(b.values))
     x = a.values[:count]
     y = b.values[:count]

@@ -469,7 +469,12 @@ class _Recorded:
 
     name = "recorded"
 
-    def __init__(self, path: Path, states: pd.DataFrame, actions: Array) -> None:
+    def __init__(
+        self,
+        path: Path,
+        states: pd.DataFrame,
+        actions: Array,
+    ) -> None:
         self._path = path
         self._states = states
         self._actions = actions

@@ -156,7 +156,9 @@ def perform(item: Item[Result]) -> Report[Result]:
 
 
 def done(
-    items: Mapping[Key, Item[Result]], jobs: int, scheduler: str | None
+    items: Mapping[Key, Item[Result]],
+    jobs: int,
+    scheduler: str | None,
 ) -> Iterator[tuple[Key, Result | Failure]]:
     """Do items; yield the key of each with its result as it ends, in no certain order.
 
@@ -208,7 +210,9 @@ def _with_key(key: Key, item: Item[Result]) -> tuple[Key, Report[Result]]:
 
 
 def _reports(
-    items: Mapping[Key, Item[Result]], jobs: int, scheduler: str | None
+    items: Mapping[Key, Item[Result]],
+    jobs: int,
+    scheduler: str | None,
 ) -> Generator[tuple[Key, Report[Result]], None, None]:
     """Reports of items by key, in no certain order."""
     if scheduler is not None:
@@ -273,7 +277,11 @@ def _on_cluster(
         logging.disable(level)
 
 
-def _next_ended(dask: Any, address: str, ended: SimpleQueue[Any]) -> Any:
+def _next_ended(
+    dask: Any,
+    address: str,
+    ended: SimpleQueue[Any],
+) -> Any:
     """The next future that has ended; raises OSError where there is no worker for long."""
     waited = 0.0
     while True:

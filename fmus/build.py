@@ -133,7 +133,10 @@ class Compiler:
         return result.stdout.splitlines()[0]
 
     def library(
-        self, sources: Mapping[str, bytes], name: str, warnings: tuple[str, ...] = WARNINGS
+        self,
+        sources: Mapping[str, bytes],
+        name: str,
+        warnings: tuple[str, ...] = WARNINGS,
     ) -> bytes:
         """Compile every ``*.c`` of the sources into one shared library.
 
@@ -274,7 +277,11 @@ def _libraries(
         return {platform: future.result() for platform, future in futures.items()}
 
 
-def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
+def build_folder(
+    folder: str | Path,
+    target: str | Path,
+    every_platform: bool = False,
+) -> Path:
     """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into an FMU.
 
     Args:
@@ -422,7 +429,11 @@ def build_model(
     )
 
 
-def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
+def token_of(
+    model: FmuModel,
+    version: FmiVersion,
+    sources: Mapping[str, bytes],
+) -> str:
     """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model.
 
     Args:

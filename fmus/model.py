@@ -337,7 +337,11 @@ _CAUSALITY = {
 }
 
 
-def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
+def model_description(
+    version: FmiVersion,
+    token: str,
+    model: FmuModel,
+) -> str:
     """The text of modelDescription.xml.
 
     Args:
@@ -403,7 +407,11 @@ def _common_attributes(variable: Variable, model: FmuModel) -> Attributes:
     }
 
 
-def _type(version: FmiVersion, variable: Variable, model: FmuModel) -> tuple[str, Attributes]:
+def _type(
+    version: FmiVersion,
+    variable: Variable,
+    model: FmuModel,
+) -> tuple[str, Attributes]:
     """The element of a variable's type and its attributes."""
     match variable.type:
         case Type.BOOLEAN:
@@ -421,7 +429,11 @@ def _type(version: FmiVersion, variable: Variable, model: FmuModel) -> tuple[str
             return element, _real_attributes(version, variable, model)
 
 
-def _real_attributes(version: FmiVersion, variable: Variable, model: FmuModel) -> Attributes:
+def _real_attributes(
+    version: FmiVersion,
+    variable: Variable,
+    model: FmuModel,
+) -> Attributes:
     attributes: dict[str, object] = {"unit": variable.unit or None}
     for key in ("min", "max", "nominal", "start"):
         value = getattr(variable, key)

@@ -78,7 +78,12 @@ def staged(folder: str | Path, owned: Iterable[str] = ()) -> Iterator[Path]:
             raise
 
 
-def _exchange(new: Path, old: Path, folder: Path, owned: Iterable[str]) -> None:
+def _exchange(
+    new: Path,
+    old: Path,
+    folder: Path,
+    owned: Iterable[str],
+) -> None:
     """Move files of `new` to a folder, and the owned ones that it lacks to `old`; all or none."""
     names = [path.relative_to(new) for path in sorted(new.rglob("*")) if path.is_file()]
     earlier = {path.relative_to(folder) for pattern in owned for path in folder.glob(pattern)}
@@ -253,7 +258,11 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
-def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
+def read_toml(
+    path: str | Path,
+    origin: str,
+    error: type[Exception],
+) -> dict[str, Any]:
     """Document of a TOML file.
 
     Args:
@@ -267,7 +276,11 @@ def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str
     return parse_toml(read_text(path, origin, error), origin, error)
 
 
-def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
+def read_json(
+    path: str | Path,
+    origin: str,
+    error: type[Exception],
+) -> dict[str, Any]:
     """Document of a JSON file, an object.
 
     Args:
@@ -284,7 +297,11 @@ def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str
     return document
 
 
-def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
+def parse_toml(
+    text: str,
+    origin: str,
+    error: type[Exception],
+) -> dict[str, Any]:
     """Document of a TOML text.
 
     Args:
@@ -298,7 +315,11 @@ def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]
     return dict(_parsed(tomllib.loads, "TOML", text, origin, error))
 
 
-def read_text(path: str | Path, origin: str, error: type[Exception]) -> str:
+def read_text(
+    path: str | Path,
+    origin: str,
+    error: type[Exception],
+) -> str:
     """Text of a UTF-8 file.
 
     Args:
@@ -323,7 +344,11 @@ def read_text(path: str | Path, origin: str, error: type[Exception]) -> str:
 
 
 def _parsed(
-    parse: Callable[[str], Any], kind: str, text: str, origin: str, error: type[Exception]
+    parse: Callable[[str], Any],
+    kind: str,
+    text: str,
+    origin: str,
+    error: type[Exception],
 ) -> Any:
     try:
         return parse(text)

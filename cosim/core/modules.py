@@ -81,7 +81,11 @@ def importing() -> Iterator[None]:
                     sys.path.remove(folder)
 
 
-def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
+def load_plugin(
+    target: str,
+    what: str,
+    error: type[Exception],
+) -> Any:
     """Import an object by its name; a module that was edited since it was loaded is loaded anew.
 
     Args:
@@ -203,7 +207,11 @@ def _forget(place: Path) -> None:
             del sys.modules[name]
 
 
-def _refuse_two_of_one_name(module: str, what: str, error: type[Exception]) -> None:
+def _refuse_two_of_one_name(
+    module: str,
+    what: str,
+    error: type[Exception],
+) -> None:
     """Raise `error` where another file in `import_folders` has a loaded module's name."""
     place = _place(module)
     if place is None:

@@ -88,7 +88,11 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     return ControllerSource.read(name).build(scenario)
 
 
-def _made(name: str, target: str, scenario: Scenario) -> Controller:
+def _made(
+    name: str,
+    target: str,
+    scenario: Scenario,
+) -> Controller:
     factory = load_plugin(target, f"controller '{name}'", ControllerLookupError)
     if not callable(factory):
         raise ControllerLookupError(f"controller '{name}' is not a factory of one scenario")

@@ -159,7 +159,12 @@ class Recorder(Protocol):
             units: of the FMU's variables, by name.
         """
 
-    def record(self, first: int, columns: Mapping[str, Array], status: Sequence[str]) -> None:
+    def record(
+        self,
+        first: int,
+        columns: Mapping[str, Array],
+        status: Sequence[str],
+    ) -> None:
         """Append K samples; the loop overwrites the arrays later.
 
         Args:

@@ -392,7 +392,11 @@ def indicators_of(
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def input_effort(actions: Array, lower: Array, upper: Array) -> float:
+def input_effort(
+    actions: Array,
+    lower: Array,
+    upper: Array,
+) -> float:
     """Mean over samples of Σᵢ |uᵢ,ₖ − uᵢ,ₖ₋₁| / (u_u − u_l)ᵢ, the share of the range moved.
 
     Args:

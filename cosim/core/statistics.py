@@ -82,7 +82,11 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
     if _all_equal(without_one, value):
         return value, value
 
-    def quotient(above: Array, below: Array, axis: int) -> Any:
+    def quotient(
+        above: Array,
+        below: Array,
+        axis: int,
+    ) -> Any:
         return np.mean(above, axis=axis) / np.mean(below, axis=axis)
 
     return _bootstrap((numerator, denominator), quotient, paired=True, method="BCa")
@@ -128,7 +132,11 @@ def gain(cost: Array, reference: Array) -> Estimate:
     return ratio(reference - cost, magnitude(reference))
 
 
-def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
+def gap_closed(
+    cost: Array,
+    naive: Array,
+    optimum: Array,
+) -> Estimate:
     """(J_naive − J)/(J_naive − J*), as a ratio of means.
 
     Args:
@@ -179,7 +187,11 @@ def gains(cost: Array, reference: Array) -> Array:
     return _quotients(reference - cost, np.abs(reference))
 
 
-def gaps_closed(cost: Array, naive: Array, optimum: Array) -> Array:
+def gaps_closed(
+    cost: Array,
+    naive: Array,
+    optimum: Array,
+) -> Array:
     """`gap_closed` of each seed by itself, (S,).
 
     Args:
@@ -327,7 +339,11 @@ def _t_interval(errors: Array, value: float) -> Interval:
     return value - half, value + half
 
 
-def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float, Interval, float]:
+def paired_difference(
+    cost: Array,
+    other: Array,
+    optimum: Array,
+) -> tuple[float, Interval, float]:
     """Median over R pairs of runs of (J − J')/|J*|.
 
     p is that of the signed ranks of the pairs' differences when their signs are flipped (Wilcoxon's
@@ -370,7 +386,11 @@ def _sign_flip_probability(differences: Array) -> float:
     return float(reached.mean())
 
 
-def two_way(cost: Array, optimum: Array, other: Array | None = None) -> Interval:
+def two_way(
+    cost: Array,
+    optimum: Array,
+    other: Array | None = None,
+) -> Interval:
     """Interval of the median over R runs of (J − J')/|J*|, over runs and noise together.
 
     Runs and noise seeds are resampled independently (percentiles).

@@ -301,7 +301,11 @@ class Trajectory(Result):
             yield [*cells, status]
 
 
-def _write(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Path:
+def _write(
+    path: str | Path,
+    header: Sequence[str],
+    rows: Iterable[Sequence[str]],
+) -> Path:
     with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(header)

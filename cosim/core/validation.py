@@ -31,7 +31,10 @@ SchemaVersion = Annotated[Literal[1], BeforeValidator(_no_boolean)]
 
 
 def validated(
-    model: type[Document], document: Any, origin: str, error: type[Exception]
+    model: type[Document],
+    document: Any,
+    origin: str,
+    error: type[Exception],
 ) -> Document:
     """The document as a model.
 
@@ -52,7 +55,12 @@ def validated(
         raise error(f"{origin}: {_complaint(dict(first), model)}{more}") from None
 
 
-def whole_number(name: str, value: Any, least: int, error: type[Exception]) -> int:
+def whole_number(
+    name: str,
+    value: Any,
+    least: int,
+    error: type[Exception],
+) -> int:
     """An argument as an integer, NumPy's too.
 
     Args:

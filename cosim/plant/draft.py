@@ -122,7 +122,11 @@ def number_roles(
     )
 
 
-def _number_names(fmu: UnpackedFmu, causality: str, variability: str = "") -> tuple[str, ...]:
+def _number_names(
+    fmu: UnpackedFmu,
+    causality: str,
+    variability: str = "",
+) -> tuple[str, ...]:
     """Names of the numbers of a causality, and of a variability if it is given."""
     names = []
     for variable in fmu.variables.values():
@@ -325,7 +329,9 @@ def _outputs_remark(report: Report) -> str:
 
 
 def _with_starts(
-    document: dict[str, Any], archive: UnpackedFmu, state: Sequence[float]
+    document: dict[str, Any],
+    archive: UnpackedFmu,
+    state: Sequence[float],
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The document with the parameters that set the states' starts, and remarks on them."""
     states = document["plant"]["states"]
@@ -347,7 +353,11 @@ def _with_starts(
     return document | {"plant": plant}, remarks
 
 
-def _reference(x: Array, u: Array, cost: float) -> dict[str, Any]:
+def _reference(
+    x: Array,
+    u: Array,
+    cost: float,
+) -> dict[str, Any]:
     return {
         "reference_state": x.tolist(),
         "reference_action": u.tolist(),
@@ -356,7 +366,10 @@ def _reference(x: Array, u: Array, cost: float) -> dict[str, Any]:
 
 
 def _start_vector(
-    fmu: UnpackedFmu, names: Sequence[str], values: Sequence[float], option: str
+    fmu: UnpackedFmu,
+    names: Sequence[str],
+    values: Sequence[float],
+    option: str,
 ) -> Array:
     """The values of an option, else the FMU's start values."""
     if values and len(values) != len(names):
@@ -381,7 +394,11 @@ def start_value(fmu: UnpackedFmu, name: str) -> float:
     return number(stated[element], 0.0)
 
 
-def action_limits(fmu: UnpackedFmu, name: str, value: float) -> tuple[float, float]:
+def action_limits(
+    fmu: UnpackedFmu,
+    name: str,
+    value: float,
+) -> tuple[float, float]:
     """Range of an action: the FMU's, and where it states none, `value` ± its magnitude.
 
     A bound that is no bound (`UnpackedFmu.range`) counts as not stated.
@@ -408,7 +425,9 @@ def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
 
 
 def _remarks(
-    document: dict[str, Any], fmu: UnpackedFmu, units: Mapping[str, str]
+    document: dict[str, Any],
+    fmu: UnpackedFmu,
+    units: Mapping[str, str],
 ) -> dict[str, str]:
     """Remark on each field and table by its dotted name."""
     plant = document["plant"]
@@ -578,7 +597,9 @@ LOOSE = 1e-6
 
 
 def nearest_steady_state(
-    plant: FmuPlant, state: Array, action: Array
+    plant: FmuPlant,
+    state: Array,
+    action: Array,
 ) -> tuple[Array, Array, float]:
     """Steady state x = Φ(x, u) of the undisturbed plant near a state and an action.
 

@@ -230,7 +230,11 @@ def _describe(path: Path, folder: Path) -> tuple[Any, tuple[str, ...]]:
     return description, flaws
 
 
-def _describe_leniently(path: Path, folder: Path, flaws: tuple[str, ...]) -> Any:
+def _describe_leniently(
+    path: Path,
+    folder: Path,
+    flaws: tuple[str, ...],
+) -> Any:
     """The description of an FMU that failed the validation, with a warning that names the flaws.
 
     Raises PlantError where it cannot be read, or lacks what a run needs.
@@ -357,7 +361,11 @@ def library_path(fmu: UnpackedFmu) -> Path:
     )
 
 
-def _instead(fmu: UnpackedFmu, folder: str, entry: str) -> list[str]:
+def _instead(
+    fmu: UnpackedFmu,
+    folder: str,
+    entry: str,
+) -> list[str]:
     """What a platform's folder has in place of the library; nothing where there is no folder."""
     prefix = f"binaries/{folder}/"
     inside = sorted(name for name in fmu.entries if name.startswith(prefix))
@@ -512,7 +520,11 @@ def _copy_of(library: Path) -> Iterator[Path]:
             Path(name).unlink()
 
 
-def _why_not_loaded(words: str, library: str, name: str) -> str:
+def _why_not_loaded(
+    words: str,
+    library: str,
+    name: str,
+) -> str:
     """What keeps a library, which is there, from being loaded; `words` are the system's."""
     missing, _, rest = words.partition(": cannot open shared object file: No such file")
     if rest and missing != library:
@@ -962,7 +974,11 @@ _logs: WeakValueDictionary[bytes, deque[str]] = WeakValueDictionary()
 
 
 def _log(
-    _: Any, instance: bytes | None, status: int, category: bytes | None, message: bytes | None
+    _: Any,
+    instance: bytes | None,
+    status: int,
+    category: bytes | None,
+    message: bytes | None,
 ) -> None:
     """Keep a message for the error that may follow.
 
@@ -1077,7 +1093,12 @@ class Fmi3Instance(Instance):
     def _instantiate(self, **where: Any) -> Any:
         messages = self.messages
 
-        def log(_: Any, status: int, category: bytes, message: bytes) -> None:
+        def log(
+            _: Any,
+            status: int,
+            category: bytes,
+            message: bytes,
+        ) -> None:
             messages.append(message.decode("utf-8", "replace"))
 
         slave = FMU3ByPath(**where)

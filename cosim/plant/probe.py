@@ -139,7 +139,11 @@ class Subject:
         )
 
 
-def subject_of(scenario: Scenario, fmu: UnpackedFmu, wiring: Wiring) -> Subject:
+def subject_of(
+    scenario: Scenario,
+    fmu: UnpackedFmu,
+    wiring: Wiring,
+) -> Subject:
     """The FMU as a scenario wires it; its actions vary about the reference within the bounds.
 
     Args:
@@ -169,7 +173,12 @@ def subject_of(scenario: Scenario, fmu: UnpackedFmu, wiring: Wiring) -> Subject:
     )
 
 
-def _two_values(variable: Any, value: float, lower: float, upper: float) -> tuple[float, float]:
+def _two_values(
+    variable: Any,
+    value: float,
+    lower: float,
+    upper: float,
+) -> tuple[float, float]:
     """A value within bounds and the variable's own range, and another one."""
     lower = max(lower, number(variable.min, -np.inf))
     upper = min(upper, number(variable.max, np.inf))
@@ -445,7 +454,12 @@ class Point(NamedTuple):
         return not jumps
 
 
-def _kind_of(i: int, points: Sequence[Point], acts: bool, starts_alike: bool) -> OutputKind:
+def _kind_of(
+    i: int,
+    points: Sequence[Point],
+    acts: bool,
+    starts_alike: bool,
+) -> OutputKind:
     """Where output i belongs, of one that changes and does not follow a set.
 
     `acts` says that it depends on the action of the same step, `starts_alike` that its value after
@@ -554,7 +568,12 @@ class Probe:
             failure="",
         )
 
-    def _examine(self, bench: _Bench, first: ProbedRun, experiment: Experiment) -> Findings:
+    def _examine(
+        self,
+        bench: _Bench,
+        first: ProbedRun,
+        experiment: Experiment,
+    ) -> Findings:
         """What the runs after a first one show; the first failure ends it."""
         seen = self._nothing_known(experiment)
         # A reset must repeat the first run to the bit, before any other run relies on it.
@@ -610,7 +629,11 @@ class Probe:
         return tuple(rows)
 
     def _kinds(
-        self, bench: _Bench, first: ProbedRun, looked: Sequence[ProbedStep], starts_alike: bool
+        self,
+        bench: _Bench,
+        first: ProbedRun,
+        looked: Sequence[ProbedStep],
+        starts_alike: bool,
     ) -> tuple[OutputKind, ...]:
         """Where each output belongs, by runs that differ in one thing.
 
@@ -644,7 +667,12 @@ class Probe:
                 kinds.append(_kind_of(i, known_points, acts, starts_alike))
         return tuple(kinds)
 
-    def _point(self, bench: _Bench, first: ProbedRun, k: int) -> Point | None:
+    def _point(
+        self,
+        bench: _Bench,
+        first: ProbedRun,
+        k: int,
+    ) -> Point | None:
         """Steps of other lengths from sample k on; None where the FMU refuses them."""
         step = self.subject.step
         before = first.samples[k - 1] if k else ProbedStep((), first.states, first.outputs)
@@ -953,7 +981,11 @@ def _still_row(still: dict[str, bool]) -> Row:
     return Row("actions that move no state", names or "none", consequence if still else "")
 
 
-def _ability_row(subject: str, fault: str, use: str) -> Row:
+def _ability_row(
+    subject: str,
+    fault: str,
+    use: str,
+) -> Row:
     return Row(subject, fault or "gives the same steps again", "not used" if fault else use)
 
 

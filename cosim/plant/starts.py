@@ -102,7 +102,11 @@ def split_name(name: str) -> tuple[str, str, str]:
     return path, "".join(rest), index
 
 
-def _has_word(name: str, base: str, word: str) -> bool:
+def _has_word(
+    name: str,
+    base: str,
+    word: str,
+) -> bool:
     """Whether a name is the base with the word added: `T_start`, `TStart`, `startT`, `start_T`."""
     plain = name.replace("_", "").lower()
     stem = base.replace("_", "").lower()
@@ -112,7 +116,9 @@ def _has_word(name: str, base: str, word: str) -> bool:
 
 
 def _starting_by(
-    scenario: Scenario, parameters: dict[str, str], values: Sequence[float]
+    scenario: Scenario,
+    parameters: dict[str, str],
+    values: Sequence[float],
 ) -> Scenario:
     """The scenario with these states alone, or with all of them and no start to be set."""
     plant = scenario.plant
@@ -141,7 +147,10 @@ def _starting_by(
 
 
 def _initial_states(
-    scenario: Scenario, fmu: UnpackedFmu, parameters: dict[str, str], values: Sequence[float]
+    scenario: Scenario,
+    fmu: UnpackedFmu,
+    parameters: dict[str, str],
+    values: Sequence[float],
 ) -> list[float]:
     """States of a new instance whose parameters have these values, after its initialisation."""
     wiring = Wiring(_starting_by(scenario, parameters, values), fmu)
@@ -162,7 +171,10 @@ def _initial_states(
 
 
 def _starts_at(
-    scenario: Scenario, fmu: UnpackedFmu, parameters: dict[str, str], values: dict[str, float]
+    scenario: Scenario,
+    fmu: UnpackedFmu,
+    parameters: dict[str, str],
+    values: dict[str, float],
 ) -> bool:
     """Whether the FMU starts at these values of the states once the parameters have them."""
     names = [name for name in scenario.plant.states if name in parameters]
@@ -178,13 +190,22 @@ def _starts_at(
     return True
 
 
-def _move(fmu: UnpackedFmu, state: str, value: float) -> float:
+def _move(
+    fmu: UnpackedFmu,
+    state: str,
+    value: float,
+) -> float:
     """By how much a probe moves a state's start."""
     nominal = number(getattr(fmu.variable(state), "nominal", None), 0.0)
     return PROBED * max(abs(value), abs(nominal), 1e-3)
 
 
-def _moved(fmu: UnpackedFmu, state: str, parameter: str, initial: float) -> float:
+def _moved(
+    fmu: UnpackedFmu,
+    state: str,
+    parameter: str,
+    initial: float,
+) -> float:
     """A start beside the initial one, within the range of the state and of the parameter."""
     move = _move(fmu, state, initial)
     state_low, state_high = fmu.range(state)

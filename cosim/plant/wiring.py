@@ -185,7 +185,11 @@ class Wiring:
         stochastic = float(law.law != "none")
         starts: list[tuple[Place, float]] = []
 
-        def add(field: str, names: str | Sequence[str] | None, values: Sequence[float]) -> None:
+        def add(
+            field: str,
+            names: str | Sequence[str] | None,
+            values: Sequence[float],
+        ) -> None:
             listed = [names] if isinstance(names, str) else names or ()
             # Either may be left out; the scenario has checked that they fit.
             for name, value in zip(listed, values, strict=False):
@@ -203,7 +207,12 @@ class Wiring:
             starts.append((place, 0.0))
         return starts
 
-    def _start_value(self, name: str, value: float, table: str) -> tuple[Place, float]:
+    def _start_value(
+        self,
+        name: str,
+        value: float,
+        table: str,
+    ) -> tuple[Place, float]:
         def misfit(variable: Any) -> str:
             if variable.type not in self.interface.setters:
                 return f"is {_a(variable.type)}, which cannot be set here"
@@ -216,7 +225,12 @@ class Wiring:
         self.start_names.append(name)
         return self._place(name, table, misfit), value
 
-    def _place(self, name: str, table: str, misfit: Callable[[Any], str]) -> Place:
+    def _place(
+        self,
+        name: str,
+        table: str,
+        misfit: Callable[[Any], str],
+    ) -> Place:
         """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is.
 
         `misfit` says what is wrong with a variable, if anything.

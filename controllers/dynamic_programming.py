@@ -1081,7 +1081,11 @@ def _accepted(optimum: Optimum) -> Optimum:
 
 
 def simulate_policy(
-    plant: PlantProblem, optimum: Optimum, *, paths: int = 2000, steps: int = 5000
+    plant: PlantProblem,
+    optimum: Optimum,
+    *,
+    paths: int = 2000,
+    steps: int = 5000,
 ) -> tuple[float, float]:
     """Mean cost per sample of a solution's policy on the plant's model.
 
@@ -1089,32 +1093,35 @@ def simulate_policy(
     state drawn from the stationary distribution; its first 300 samples are left out.
 
     Args:
-        plant: The plant's model with its law and parameters.
-        optimum: The solution.
-        paths: Number of paths.
-        steps: Samples of each that count.
+        plant: its model and the law of its disturbances.
+        optimum: the solution.
+        paths: how many, all at once.
+        steps: samples of each path that count.
 
     Returns:
-        The mean, and half of its 95 % interval.
+        The mean, and half its 95 % interval.
     """
-    generator = np.random.default_rng(0)
     burn_in = 300
+    rng = np.random.default_rng(0)
     problem = plant.problem
-    sampled = discretise(problem.model, problem.sampling_time, optimum.accuracy.substeps)
-    step = Elementwise(sampled)
-    cost = Elementwise(economic_cost(problem.model))
-    table = Grid(optimum.grid.axes)
-    policy = [table.interpolant(column) for column in optimum.actions.T]
-    share = optimum.distribution / optimum.distribution.sum()
-    x = list(table.points[generator.choice(table.size, paths, p=share)].T)
+    step = Elementwise(discretise(problem.model, problem.sampling_time, optimum.accuracy.substeps))
+    stage_cost = Elementwise(economic_cost(problem.model))
+    grid = Grid(optimum.grid.axes)
+    policy = [grid.interpolant(column) for column in optimum.actions.T]
+    probabilities = optimum.distribution / optimum.distribution.sum()
+    start = rng.choice(grid.size, paths, p=probabilities)
+    # An array (paths,) for each state, action and disturbance.
+    x = list(grid.points[start].T)
     total = np.zeros(paths)
     for k in range(burn_in + steps):
-        u = [entry(x) for entry in policy]
-        d = list(plant.law.draw(generator, paths).T)
+        u = [action(x) for action in policy]
+        d = list(plant.law.draw(rng, paths).T)
         if k >= burn_in:
-            total += cost(x, u, d, plant.parameters)[0]
+            total += stage_cost(x, u, d, plant.parameters)[0]
             total += problem.penalty.along(np.stack(x, axis=1))
-        x = [np.broadcast_to(entry, paths) for entry in step(x, u, d, plant.parameters)]
+        next_x = step(x, u, d, plant.parameters)
+        # A state that depends on no other may be one number.
+        x = [np.broadcast_to(state, paths) for state in next_x]
     means = total / steps
     half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
     return float(means.mean()), float(half_width)

@@ -56,23 +56,25 @@ def __dir__() -> list[str]:
 
 
 def _refuse_shadows() -> None:
-    """Raise ImportError in one line where a user's file has the name of one of our packages."""
-    root = Path(__file__).parents[1]
+    """Raise ImportError where a user's file or folder has the name of one of our packages."""
+    root = Path(__file__).parents[1].resolve()
     for name in ("controllers", "fmus", "learning"):
-        loaded = sys.modules.get(name)
-        spec = find_spec(name) if loaded is None else loaded.__spec__
-        origin = None if spec is None else spec.origin
-        if origin is not None and Path(origin).resolve() == (root / name / "__init__.py").resolve():
-            continue
-        found = origin or next(iter(getattr(spec, "submodule_search_locations", None) or ()), name)
-        line = (
-            f"'{found}' hides the package '{name}' of rti-cosim: rename it, or start Python in "
-            "another folder"
-        )
-        if sys.argv[:1] == ["-m"]:  # of `python -m cosim`, which prints no traceback
-            print(f"error: {line}", file=sys.stderr)
-            raise SystemExit(2)
-        raise ImportError(line)
+        spec = find_spec(name)
+        assert spec is not None
+        # A folder without __init__.py has no origin.
+        origin = spec.origin
+        if origin is None or Path(origin).resolve().parents[1] != root:
+            place = origin or next(iter(spec.submodule_search_locations or ()), name)
+            line = (
+                f"'{place}' hides the package '{name}' of rti-cosim: rename it, or start Python "
+                "in another folder"
+            )
+            # `python -m cosim` is a command: one line, no traceback.
+            if sys.argv[:1] == ["-m"]:
+                print(f"error: {line}", file=sys.stderr)
+                raise SystemExit(2)
+            raise ImportError(line)
 
 
+# A script's own folder is searched first, so that a file `learning.py` beside it is imported.
 _refuse_shadows()

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.errors import ComparisonError, ScenarioError
 from cosim.core.protocols import Array
@@ -17,34 +18,45 @@ from cosim.core.scenario import Scenario
 from cosim.core.trajectory import RunSignals, Signal, clocked, read_signals
 from cosim.core.validation import instead
 
-# The residual is itself a rounding error: a share of it is no tolerance.
-_ERROR = "residual"
+RESIDUAL = "residual"
+"""Signal that is itself a rounding error: a share of it is no tolerance."""
 
 
 def load_run(path: str | Path) -> RunSignals:
-    """Load a run from a folder that holds trajectory.csv, from such a CSV, or from a `.rrd` file.
+    """Load a run.
 
-    Raises ComparisonError where there is no run, TrajectoryError or RecordingError where one is not
-    readable.
+    Args:
+        path: a folder that holds trajectory.csv, such a CSV, or a `.rrd` file.
+
+    Raises:
+        ComparisonError: there is no run.
+        TrajectoryError: the CSV is not readable.
+        RecordingError: the recording is not readable.
     """
     path = Path(path)
     if path.is_dir():
         path = path / "trajectory.csv"
     if not path.is_file():
         raise ComparisonError(f"there is no run at '{path}'; give a run's folder, CSV or .rrd")
-    if path.suffix != ".rrd":
-        bounds: Mapping[str, tuple[float, float]] = {}
-        with suppress(ScenarioError):
-            bounds = Scenario.load(path.parent / "scenario.toml").limits
-        return RunSignals(str(path), *read_signals(path), bounds)
-    from cosim.recording.read import read_recording  # noqa: PLC0415 - half a second, for .rrd only
+    if path.suffix == ".rrd":
+        return _load_recording(path)
+    bounds: Mapping[str, tuple[float, float]] = {}
+    # A run without its scenario can be compared, and drawn without bounds.
+    with suppress(ScenarioError):
+        bounds = Scenario.load(path.parent / "scenario.toml").limits
+    signals, status = read_signals(path)
+    return RunSignals(str(path), signals, status, bounds)
+
+
+def _load_recording(path: Path) -> RunSignals:
+    """Signals of a `.rrd` file, without times of the clock and predictions."""
+    from cosim.recording.read import read_recording  # noqa: PLC0415 - half a second
 
     recording = read_recording(path)
-    signals = {
-        name: Signal(name, recording.units[name], values)
-        for name, values in recording.signals.items()
-        if values.ndim == 1 and name not in clocked()
-    }
+    signals = {}
+    for name, values in recording.signals.items():
+        if values.ndim == 1 and name not in clocked():
+            signals[name] = Signal(name, recording.units[name], values)
     return RunSignals(str(path), signals, recording.status, ordered=False)
 
 
@@ -52,9 +64,13 @@ def load_run(path: str | Path) -> RunSignals:
 class Difference:
     """Difference of one signal between runs A and B over their common samples.
 
-    `maximum` is max |a − b| (infinite where only one is NaN) at sample `at`, with the values `a`
-    and `b` there; `first` is the first sample with |a − b| > `tolerance`, or, without a tolerance,
-    whose bits differ; None if there is none.
+    Attributes:
+        name, unit: of the signal.
+        tolerance: in its unit; None: every bit counts.
+        maximum: max |a − b|, infinite where only one is NaN.
+        at: number of the sample where it is.
+        a, b: the values there.
+        first: first sample with |a − b| > `tolerance`, or whose bits differ; None if there is none.
     """
 
     name: str
@@ -78,11 +94,16 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The `differences` of two runs by signal, and all others.
+    """The differences of two runs, A and B.
 
-    `samples` are the two lengths; `only_first` and `only_second` signals of one run; `units`
-    different units by signal; `order` the first position at which the order of the signals differs;
-    `status` the first sample whose status differs; `times` (K,) in s are those of A.
+    Attributes:
+        samples: the two lengths.
+        differences: one for each signal of both.
+        only_first, only_second: signals of one run alone.
+        units: different units, by signal.
+        order: first position at which the order of the signals differs; None: nowhere.
+        status: first sample whose status differs; None: nowhere.
+        times: of A's samples in s, (K,).
     """
 
     samples: tuple[int, int]
@@ -102,37 +123,56 @@ class Comparison:
     @property
     def first(self) -> int | None:
         """First sample at which any signal or the status differs."""
-        steps = [d.first for d in self.differences if d.first is not None]
-        return min((*steps, *([] if self.status is None else [self.status])), default=None)
+        samples = [difference.first for difference in self.differences]
+        samples.append(self.status)
+        return min((sample for sample in samples if sample is not None), default=None)
 
     def lines(self) -> list[str]:
         """The differences in words: the first one, then names, units and order."""
-        text = []
-        if (step := self.first) is not None:
-            at = f" (time {self.times[step]:g} s)" if len(self.times) > step else ""
-            found = [d.text() for d in self.differences if d.first == step]
-            found += ["status"] if self.status == step else []
-            text += [f"first difference at sample {step}{at}:", *(f"  {one}" for one in found)]
-        if len(set(self.samples)) > 1:
-            text.append(f"{self.samples[0]} samples against {self.samples[1]}")
-        for missing, side in ((self.only_first, "first"), (self.only_second, "second")):
-            if missing:
-                text.append(f"only the {side} has {', '.join(missing)}")
-        text += [f"{name} is in '{a}' against '{b}'" for name, (a, b) in self.units.items()]
+        lines = self._lines_of_first()
+        first_length, second_length = self.samples
+        if first_length != second_length:
+            lines.append(f"{first_length} samples against {second_length}")
+        if self.only_first:
+            lines.append(f"only the first has {', '.join(self.only_first)}")
+        if self.only_second:
+            lines.append(f"only the second has {', '.join(self.only_second)}")
+        for name, (unit, other_unit) in self.units.items():
+            lines.append(f"{name} is in '{unit}' against '{other_unit}'")
         if self.order is not None:
-            text.append(f"the columns stand in another order from column {self.order + 1} on")
-        return text
+            lines.append(f"the columns stand in another order from column {self.order + 1} on")
+        return lines
+
+    def _lines_of_first(self) -> list[str]:
+        """What differs at the first sample where anything does."""
+        sample = self.first
+        if sample is None:
+            return []
+        time = f" (time {self.times[sample]:g} s)" if len(self.times) > sample else ""
+        lines = [f"first difference at sample {sample}{time}:"]
+        for difference in self.differences:
+            if difference.first == sample:
+                lines.append(f"  {difference.text()}")
+        if self.status == sample:
+            lines.append("  status")
+        return lines
 
     def document(self) -> dict[str, Any]:
         """The comparison as plain values, ready for JSON."""
-        names = ("samples", "only_first", "only_second", "units", "order")
-        shown = ("unit", "tolerance", "maximum", "at", "first")
-        return {
-            "equal": self.equal,
-            "first_difference": self.first,
-            **{name: getattr(self, name) for name in names},
-            "signals": {d.name: {key: getattr(d, key) for key in shown} for d in self.differences},
-        }
+        document: dict[str, Any] = {"equal": self.equal, "first_difference": self.first}
+        for name in ("samples", "only_first", "only_second", "units", "order"):
+            document[name] = getattr(self, name)
+        signals = {}
+        for difference in self.differences:
+            signals[difference.name] = {
+                "unit": difference.unit,
+                "tolerance": difference.tolerance,
+                "maximum": difference.maximum,
+                "at": difference.at,
+                "first": difference.first,
+            }
+        document["signals"] = signals
+        return document
 
 
 def compare(
@@ -144,11 +184,18 @@ def compare(
 ) -> Comparison:
     """Compare two runs; two NaN are equal.
 
-    A signal's tolerance is `tolerances[name]`, in its unit, else `relative` times its largest
-    magnitude in A; without either every bit counts, so that −0.0 is not 0.0. The solver's
-    `residual` is left out of `relative`: it counts with a tolerance of its own, or to the bit.
+    A signal's tolerance is its own of `tolerances`, else `relative` times its largest magnitude in
+    A; without either every bit counts, so that −0.0 is not 0.0. The solver's `residual` is left out
+    of `relative`: it counts with a tolerance of its own, or to the bit.
 
-    Raises ComparisonError on a tolerance for a signal that neither run has, or a negative one.
+    Args:
+        a: a run.
+        b: another one.
+        tolerances: by signal, in its unit.
+        relative: share of a signal's largest magnitude.
+
+    Raises:
+        ComparisonError: a tolerance is negative, or for a signal that neither run has.
     """
     if not 0 <= relative < inf:
         raise ComparisonError(f"relative (--relative) must be finite and ≥ 0, not {relative}")
@@ -161,50 +208,87 @@ def compare(
             )
         if not value >= 0:
             raise ComparisonError(f"the tolerance of '{name}' must not be negative, not {value}")
-    both = [name for name in a.signals if name in b.signals]
+    common = [name for name in a.signals if name in b.signals]
     differences = []
-    for name in both:
+    units = {}
+    for name in common:
+        signal = a.signals[name]
+        other = b.signals[name]
         tolerance = tolerances.get(name)
         if tolerance is None and relative:
-            values = a.signals[name].values
-            largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
-            tolerance = inf if name == _ERROR else float(relative * largest)
-        differences.append(_difference(a.signals[name], b.signals[name], tolerance))
+            tolerance = _tolerance_of_size(signal, relative)
+        differences.append(_difference(signal, other, tolerance))
+        if signal.unit != other.unit:
+            units[name] = (signal.unit, other.unit)
+    # A recording keeps its signals by name, in no order.
+    order = common
+    if a.ordered and b.ordered:
+        order = [name for name in b.signals if name in a.signals]
     time = a.signals.get("time")
-    order = [name for name in b.signals if name in a.signals] if a.ordered and b.ordered else both
     return Comparison(
         samples=(len(a), len(b)),
         differences=differences,
         only_first=[name for name in a.signals if name not in b.signals],
         only_second=[name for name in b.signals if name not in a.signals],
-        units={
-            name: units
-            for name in both
-            if len(set(units := (a.signals[name].unit, b.signals[name].unit))) > 1
-        },
-        order=_first([x != y for x, y in zip(both, order, strict=True)]),
-        status=_first([x != y for x, y in zip(a.status, b.status, strict=False)]),
+        units=units,
+        order=_first_unequal(common, order),
+        status=_first_unequal(a.status, b.status),
         times=np.empty(0) if time is None else time.values,
     )
 
 
-def _difference(a: Signal, b: Signal, tolerance: float | None) -> Difference:
-    common = min(len(a.values), len(b.values))
-    x, y = a.values[:common], b.values[:common]
+def _tolerance_of_size(signal: Signal, relative: float) -> float:
+    """`relative` times a signal's largest magnitude."""
+    if signal.name == RESIDUAL:
+        return inf
+    finite = signal.values[np.isfinite(signal.values)]
+    return float(relative * np.abs(finite).max(initial=0.0))
+
+
+def _difference(
+    a: Signal,
+    b: Signal,
+    tolerance: float | None,
+) -> Difference:
+    count = min(len(a.values), len(b.values))
+    x = a.values[:count]
+    y = b.values[:count]
+    both_missing = np.isnan(x) & np.isnan(y)
+    # ∞ − ∞ is no number, and no difference.
     with np.errstate(invalid="ignore"):
         distance = np.abs(x - y)
-    missing = np.isnan(x) & np.isnan(y)
-    distance = np.where((x == y) | missing, 0.0, np.where(np.isnan(distance), inf, distance))
+    distance[np.isnan(distance)] = inf
+    distance[(x == y) | both_missing] = 0.0
     if tolerance is None:
-        beyond = (x.view(np.int64) != y.view(np.int64)) & ~missing
+        beyond = (x.view(np.int64) != y.view(np.int64)) & ~both_missing
     else:
         beyond = distance > tolerance
     first = _first(beyond)
-    at = int(np.argmax(distance)) if common and distance.max() > 0 else first or 0
-    here = (float(x[at]), float(y[at]), float(distance[at])) if common else (np.nan, np.nan, 0.0)
-    return Difference(a.name, a.unit, tolerance, here[2], at, here[0], here[1], first)
+    if not count:
+        return Difference(a.name, a.unit, tolerance, 0.0, 0, np.nan, np.nan, first)
+    # −0.0 and 0.0 differ in their bits, by no distance.
+    at = int(np.argmax(distance)) if distance.max() > 0 else first or 0
+    return Difference(
+        name=a.name,
+        unit=a.unit,
+        tolerance=tolerance,
+        maximum=float(distance[at]),
+        at=at,
+        a=float(x[at]),
+        b=float(y[at]),
+        first=first,
+    )
 
 
-def _first(differs: Sequence[bool] | np.ndarray) -> int | None:
+def _first(differs: NDArray[np.bool_]) -> int | None:
+    """Place of the first True, or None."""
     rows = np.flatnonzero(differs)
     return int(rows[0]) if rows.size else None
+
+
+def _first_unequal(words: Sequence[str], others: Sequence[str]) -> int | None:
+    """First place at which two lists of words differ, as far as both go; or None."""
+    for place, (word, other) in enumerate(zip(words, others, strict=False)):
+        if word != other:
+            return place
+    return None

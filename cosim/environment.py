@@ -25,7 +25,7 @@ Single = NDArray[np.float32]
 SHARE = 0.1
 """Share of the operating point that is one in normalised units."""
 EPISODE_STEPS = 500
-SHOWN = 120
+SAMPLES_SHOWN = 120
 """Samples that a rendered image looks back."""
 
 
@@ -41,16 +41,22 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(
-        self, scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None
+        self,
+        scenario: Scenario | str | Path = "paper",
+        *,
+        render_mode: str | None = None,
     ) -> None:
         self.render_mode = render_mode
         self._plant = FmuPlant(scenario)
-        limits = self.scenario.action_lower.copy(), self.scenario.action_upper.copy()
         # The FMU's own ranges of its states.
-        self.observation_space = Box(*self._plant.state_range, dtype=np.float64)
-        self.action_space = Box(*limits, dtype=np.float64)
-        self._states: deque[Array] = deque(maxlen=SHOWN + 1)
-        self._actions: deque[Array] = deque(maxlen=SHOWN)
+        low, high = self._plant.state_range
+        self.observation_space = Box(low, high, dtype=np.float64)
+        # Gymnasium may write to its arrays, a scenario's are read-only.
+        lower = self.scenario.action_lower.copy()
+        upper = self.scenario.action_upper.copy()
+        self.action_space = Box(lower, upper, dtype=np.float64)
+        self._states: deque[Array] = deque(maxlen=SAMPLES_SHOWN + 1)
+        self._actions: deque[Array] = deque(maxlen=SAMPLES_SHOWN)
 
     @property
     def scenario(self) -> Scenario:
@@ -60,14 +66,26 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode; `options={"initial_state": x}` starts it from x (n,)."""
+        """Start an episode.
+
+        Args:
+            seed: of the noise; without it a new one is drawn.
+            options: `{"initial_state": x}` starts the episode from x (n,).
+
+        Returns:
+            The state, (n,), and an empty dictionary.
+        """
         super().reset(seed=seed)
         unknown = set(options or ()) - {"initial_state"}
         if unknown:
             raise PlantError(f"unknown reset option {sorted(unknown)}; there is initial_state")
         start = (options or {}).get("initial_state")
-        drawn = int(self.np_random.integers(1 << 63)) if seed is None else spawn_seeds(seed)[0]
-        s = self._plant.reset(drawn, start)
+        if seed is None:
+            plant_seed = int(self.np_random.integers(1 << 63))
+        else:
+            # The noise of a simulation on this seed.
+            plant_seed, _ = spawn_seeds(seed)
+        s = self._plant.reset(plant_seed, start)
         self._states.clear()
         self._actions.clear()
         self._states.append(s)
@@ -116,7 +134,10 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
     """
 
     def __init__(
-        self, scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None
+        self,
+        scenario: Scenario | str | Path = "paper",
+        *,
+        render_mode: str | None = None,
     ) -> None:
         env: Any = PlantEnv(scenario, render_mode=render_mode)
         super().__init__(env)
@@ -125,11 +146,12 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         width = task.state_upper - task.state_lower
         magnitude = np.abs(task.reference_state)
         self.state_scale: Array = SHARE * np.where(magnitude > 0, magnitude, width)
-        cost = task.controller.reference_cost
-        self.reference_cost, self.cost_scale = cost, SHARE * abs(cost) or 1.0
-        seen = env.observation_space
+        self.reference_cost = task.controller.reference_cost
+        self.cost_scale = SHARE * abs(self.reference_cost) or 1.0
+        # A bound that is none may exceed the floats of 32 bits.
         with np.errstate(over="ignore"):
-            low, high = map(self._normalised, (seen.low, seen.high))
+            low = self._normalised(env.observation_space.low)
+            high = self._normalised(env.observation_space.high)
         ones = np.ones(len(task.plant.actions), dtype=np.float32)
         self.observation_space = Box(low, high, dtype=np.float32)
         self.action_space = Box(-ones, ones, dtype=np.float32)
@@ -140,17 +162,24 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Single, dict[str, Any]]:
-        """Start an episode, as `PlantEnv.reset` does; `options` are in physical units."""
+        """Start an episode, as `PlantEnv.reset` does.
+
+        Args:
+            seed: of the noise; without it a new one is drawn.
+            options: in physical units.
+        """
         s, info = self.env.reset(seed=seed, options=options)
         return self._normalised(s), info
 
     def step(self, action: ArrayLike) -> tuple[Single, float, bool, bool, dict[str, Any]]:
         """Hold an action of [−1, 1]ᵐ for one sample; raises PlantError on another shape."""
-        lower, upper = self._scenario.action_lower, self._scenario.action_upper
+        lower = self._scenario.action_lower
+        upper = self._scenario.action_upper
         values = np.asarray(action, dtype=np.float64)
         if values.shape != lower.shape:
             raise PlantError(f"an action has shape {lower.shape}, not {values.shape}")
-        physical = lower + 0.5 * (np.clip(values, -1.0, 1.0) + 1.0) * (upper - lower)
+        share = 0.5 * (np.clip(values, -1.0, 1.0) + 1.0)
+        physical = lower + share * (upper - lower)
         s, reward, terminated, truncated, info = self.env.step(physical)
         scaled = (self.reference_cost + float(reward)) / self.cost_scale
         return self._normalised(s), scaled, terminated, truncated, info

@@ -32,8 +32,10 @@ from cosim.workers import Conditions, Failure, done
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-NAIVE, OPTIMAL = "naive", "optimal"
-EVALUATION, TIMING = "evaluation.csv", "timing.csv"
+NAIVE = "naive"
+OPTIMAL = "optimal"
+EVALUATION = "evaluation.csv"
+TIMING = "timing.csv"
 FILES = (EVALUATION, TIMING, "evaluation.png", "scenario.toml", "summary.json", "judged.csv")
 """Files of an evaluation; all in a folder belong to one."""
 MOST_SEEDS = 1_000_000
@@ -89,24 +91,29 @@ def evaluate(
         CosimError: another process writes to the folder; and what building or running a
             controller raises.
     """
-    scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
-    numbers = _numbers(seeds)
+    if not isinstance(scenario, Scenario):
+        scenario = Scenario.load(scenario)
+    seed_numbers = _distinct_seeds(seeds)
     steps = whole_number("steps", steps, 1, EvaluationError)
     named = named_controllers(controllers)
-    _check(named, numbers)
+    _check_names(named)
     wanted = list(named)
-    if OPTIMAL not in named and (optimum := stored_optimum(scenario)) is not None:
-        named[OPTIMAL] = optimum
+    if OPTIMAL not in named:
+        optimum = stored_optimum(scenario)
+        if optimum is not None:
+            named[OPTIMAL] = optimum
+    noise = Noise(seed_numbers, steps)
+    # Hold the folder before the work, which may take hours.
     with holding(Path(folder)) if folder is not None else nullcontext():
-        evaluation = _evaluated(
-            scenario, named, wanted, Noise(numbers, steps), jobs, scheduler, progress, command
+        evaluation = _measure_all(
+            scenario, named, wanted, noise, jobs, scheduler, progress, command
         )
         if folder is not None:
             evaluation.write(folder)
     return evaluation
 
 
-def _evaluated(
+def _measure_all(
     scenario: Scenario,
     named: Mapping[str, Factory | str],
     wanted: Sequence[str],
@@ -119,29 +126,39 @@ def _evaluated(
     """Measure each of the controllers on the noise; the `wanted` have rows of their own."""
     items: dict[tuple[str, int], MeasureItem] = {}
     parameters = {}
-    for name, given in named.items():
-        source = ControllerSource.read(given) if isinstance(given, str) else given
-        conditions = Conditions.of_now(scenario, given)
+    for name, description in named.items():
+        source = ControllerSource.read(description) if isinstance(description, str) else description
+        conditions = Conditions.of_now(scenario, description)
+        # Built here once, so that a fault shows before any worker starts.
         parameters[name] = parameters_hash(built(source, conditions.scenario))
-        whole = MeasureItem(conditions, source, noise, noise.length)
-        items |= {(name, part.noise.seeds[0]): part for part in whole.parts()}
+        all_seeds = MeasureItem(conditions, source, noise, noise.length)
+        for part in all_seeds.parts():
+            items[name, part.noise.seeds[0]] = part
     facts = conditions.facts
     measured = {name: Measured() for name in named}
-    done_samples, total = 0, len(named) * noise.samples
-    with reporting(progress, scenario.name, total) as tell:
+    n_done = 0
+    total = len(named) * noise.samples
+    with reporting(progress, scenario.name, total) as report:
         for key, result in done(items, jobs, scheduler):
+            # A mean over fewer seeds would be another figure under the same name.
             if isinstance(result, Failure):
                 raise result.error()
-            measured[key[0]].indicators |= result.indicators
-            measured[key[0]].timing |= result.timing
-            done_samples += items[key].noise.samples
-            tell(done_samples, f"{done_samples / total:.0%}", "")
+            name = key[0]
+            measured[name].indicators.update(result.indicators)
+            measured[name].timing.update(result.timing)
+            n_done += items[key].noise.samples
+            report(n_done, f"{n_done / total:.0%}", "")
+    columns = {}
+    timing = {}
+    for name, measurement in measured.items():
+        columns[name] = _frame(measurement.indicators, noise.seeds)
+        timing[name] = _frame(measurement.timing, noise.seeds)
     return Evaluation(
         scenario=scenario,
         controllers=wanted,
         seeds=noise.seeds,
-        columns={name: _frame(found.indicators, noise.seeds) for name, found in measured.items()},
-        timing={name: _frame(found.timing, noise.seeds) for name, found in measured.items()},
+        columns=columns,
+        timing=timing,
         parameters=parameters,
         facts={
             "scenario": scenario.name,
@@ -164,13 +181,21 @@ def _frame(rows: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> pd.
 def named_controllers(
     controllers: Mapping[str, Factory | str] | Sequence[str],
 ) -> dict[str, Factory | str]:
-    """Controllers by name from SPEC or NAME=SPEC; raises EvaluationError if invalid."""
+    """Controllers by name.
+
+    Args:
+        controllers: a mapping, or texts CONTROLLER or NAME=CONTROLLER.
+
+    Raises:
+        EvaluationError: one is neither a text nor a factory, or two have one name.
+    """
     if isinstance(controllers, Mapping):
-        for name, given in controllers.items():
-            if not isinstance(name, str) or not (isinstance(given, str) or callable(given)):
+        for name, controller in controllers.items():
+            is_one = isinstance(controller, str) or callable(controller)
+            if not isinstance(name, str) or not is_one:
                 raise EvaluationError(
                     f"controllers: '{name}' must be a name or a factory(scenario), not "
-                    f"a {type(given).__name__}"
+                    f"a {type(controller).__name__}"
                 )
         return dict(controllers)
     if isinstance(controllers, str) or not isinstance(controllers, Sequence):
@@ -179,9 +204,12 @@ def named_controllers(
     for item in controllers:
         if not isinstance(item, str):
             raise EvaluationError(f"controllers: a {type(item).__name__} is no name")
-        name, equals, text = (part.strip() for part in item.partition("="))
-        source = text if equals else name
-        name = Path(name).stem if name.endswith(".toml") else name
+        name, equals, source = (part.strip() for part in item.partition("="))
+        if not equals:
+            source = name
+        # A file of θ is called by its stem.
+        if name.endswith(".toml"):
+            name = Path(name).stem
         if not name or not source:
             raise EvaluationError(f"controllers: '{item}' is not NAME=CONTROLLER")
         if name in named:
@@ -190,8 +218,20 @@ def named_controllers(
     return named
 
 
-def _numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
-    """Seeds as integers; raises EvaluationError where they are none."""
+def _distinct_seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
+    """Seeds as integers; raises EvaluationError where they are none, or one is there twice."""
+    numbers = _seed_numbers(seeds)
+    if not numbers:
+        raise EvaluationError("no seed to evaluate on; give at least one")
+    if len(set(numbers)) < len(numbers):
+        raise EvaluationError("seeds must be distinct")
+    if max(numbers) >= 1 << 64:
+        raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(numbers)}")
+    return numbers
+
+
+def _seed_numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
+    # An array without dimensions is a number.
     no_list = isinstance(seeds, str | bytes | Mapping) or getattr(seeds, "ndim", 1) == 0
     if no_list or not isinstance(seeds, Iterable):
         count = whole_number("seeds", seeds, 1, EvaluationError)
@@ -201,18 +241,13 @@ def _numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
     return tuple(whole_number("a seed", seed, 0, EvaluationError) for seed in seeds)
 
 
-def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int]) -> None:
+def _check_names(controllers: Mapping[str, Factory | str]) -> None:
+    """Refuse no controller, and another one by the name of the optimum."""
     if not controllers:
         raise EvaluationError("no controller to evaluate")
-    own = controllers.get(OPTIMAL, OPTIMAL)
-    if isinstance(own, str) and own != OPTIMAL:
-        raise EvaluationError(f"'{OPTIMAL}' names the controller that gives J*, not '{own}'")
-    if not seeds:
-        raise EvaluationError("no seed to evaluate on; give at least one")
-    if len(set(seeds)) < len(seeds):
-        raise EvaluationError("seeds must be distinct")
-    if max(seeds) >= 1 << 64:
-        raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
+    optimal = controllers.get(OPTIMAL, OPTIMAL)
+    if isinstance(optimal, str) and optimal != OPTIMAL:
+        raise EvaluationError(f"'{OPTIMAL}' names the controller that gives J*, not '{optimal}'")
 
 
 NO_NOISE = "no noise: all seeds are the same run, and an interval of width 0 says nothing"
@@ -222,8 +257,13 @@ NO_NOISE = "no noise: all seeds are the same run, and an interval of width 0 say
 class Evaluation(Result):
     """Indicators of controllers × seeds on common random numbers.
 
-    `columns` and `timing` hold the measurements by controller: a frame with a row for each seed.
-    `parameters` are each controller's hash; `facts` are the columns that do not vary.
+    Attributes:
+        scenario: on which they were measured.
+        controllers: names of those that have rows, as given.
+        seeds: of the noise, S of them.
+        columns, timing: measurements by controller, a frame with a row for each seed.
+        parameters: hash of each controller's parameters.
+        facts: the table's columns that do not vary.
     """
 
     scenario: Scenario
@@ -235,11 +275,16 @@ class Evaluation(Result):
     facts: Mapping[str, Any]
 
     def _facts(self) -> dict[str, object]:
-        known = {f"J of {name}": float(self.column(name, "J").mean()) for name in self.controllers}
+        facts: dict[str, object] = {
+            "scenario": self.facts["scenario"],
+            "steps": self.facts["steps"],
+            "seeds": len(self.seeds),
+        }
+        for name in self.controllers:
+            facts[f"J of {name}"] = float(self.column(name, "J").mean())
         if self.optimum is not None:
-            known["J*"] = float(self.optimal.mean())
-        facts = {name: self.facts[name] for name in ("scenario", "steps")}
-        return facts | {"seeds": len(self.seeds)} | known
+            facts["J*"] = float(self.optimal.mean())
+        return facts
 
     @property
     def optimum(self) -> str | None:
@@ -257,29 +302,49 @@ class Evaluation(Result):
         return self._cost(OPTIMAL)
 
     def column(self, controller: str, name: str) -> Array:
-        """An indicator of a controller over the seeds, (S,); raises EvaluationError on others."""
-        for word, known in ((controller, self.columns), (name, next(iter(self.columns.values())))):
-            if word not in known:
-                raise EvaluationError(f"there is no '{word}'{instead(word, map(str, known))}")
-        return np.asarray(self.columns[controller][name])
+        """An indicator of a controller over the seeds, (S,).
+
+        Args:
+            controller: its name.
+            name: the indicator's.
+
+        Raises:
+            EvaluationError: there is no such controller or indicator.
+        """
+        if controller not in self.columns:
+            raise EvaluationError(f"there is no '{controller}'{instead(controller, self.columns)}")
+        frame = self.columns[controller]
+        if name not in frame:
+            raise EvaluationError(f"there is no '{name}'{instead(name, map(str, frame))}")
+        return np.asarray(frame[name])
 
     @property
     def without_noise(self) -> bool:
         """Whether all seeds, of which there are several, gave each controller the same run."""
-        costs = [self.column(name, "J") for name in self.controllers]
-        return len(self.seeds) > 1 and all((cost == cost[0]).all() for cost in costs)
+        if len(self.seeds) == 1:
+            return False
+        for name in self.controllers:
+            cost = self.column(name, "J")
+            if (cost != cost[0]).any():
+                return False
+        return True
 
     def _cost(self, controller: str) -> Array:
         """J over the seeds, (S,), NaN of a controller that was not evaluated."""
-        there = controller in self.columns
-        return self.column(controller, "J") if there else np.full(len(self.seeds), np.nan)
+        if controller not in self.columns:
+            return np.full(len(self.seeds), np.nan)
+        return self.column(controller, "J")
 
     def to_pandas(self) -> pd.DataFrame:
         """A row for each controller, as given, and seed; NaN where an indicator is undefined."""
         frame = self._rows(self.columns).assign(**self.facts)
-        cost, names = frame.J.to_numpy(), (NAIVE, OPTIMAL, self.reference)
-        naive, optimal, reference = (np.tile(self._cost(n), len(self.controllers)) for n in names)
         frame["parameters_hash"] = frame.controller.map(self.parameters)
+        cost = frame.J.to_numpy()
+        # The rows of all controllers are on the same seeds, one controller after the other.
+        repeats = len(self.controllers)
+        naive = np.tile(self._cost(NAIVE), repeats)
+        optimal = np.tile(self._cost(OPTIMAL), repeats)
+        reference = np.tile(self._cost(self.reference), repeats)
         frame["regret"] = statistics.regrets(cost, optimal)
         frame["gap_closed"] = statistics.gaps_closed(cost, naive, optimal)
         frame["gain_in_J"] = statistics.gains(cost, reference)
@@ -335,51 +400,63 @@ class Evaluation(Result):
         (J_ref − J)/|J_ref|. Every interval is of 95 %, paired over seeds, `interval` Student's and
         `bootstrap` BCa. `optimal_J` is J* on the same seeds.
         """
-        return {
-            **self.facts,
-            "seeds": list(self.seeds),
-            **({"remark": NO_NOISE} if self.without_noise else {}),
-            "reference": self.reference,
-            "optimum": self.optimum,
-            "optimal_J": None if self.optimum is None else float(np.mean(self.optimal)),
-            "controllers": {name: self._controller(name) for name in self.controllers},
-            "comparisons": [
-                self._comparison(name, reference)
-                for i, name in enumerate(self.controllers)
-                for reference in self.controllers[:i]
-            ],
-            "timing": {name: self.timing[name].median().to_dict() for name in self.controllers},
-        }
+        comparisons = []
+        for number, name in enumerate(self.controllers):
+            for reference in self.controllers[:number]:
+                comparisons.append(self._comparison(name, reference))
+        document: dict[str, Any] = dict(self.facts)
+        document["seeds"] = list(self.seeds)
+        if self.without_noise:
+            document["remark"] = NO_NOISE
+        document["reference"] = self.reference
+        document["optimum"] = self.optimum
+        document["optimal_J"] = None if self.optimum is None else float(np.mean(self.optimal))
+        document["controllers"] = {name: self._controller(name) for name in self.controllers}
+        document["comparisons"] = comparisons
+        medians = {name: self.timing[name].median().to_dict() for name in self.controllers}
+        document["timing"] = medians
+        return document
 
     def _controller(self, name: str) -> dict[str, Any]:
-        estimates = {key: statistics.mean(self.column(name, key))._asdict() for key in MEANS}
-        document: dict[str, Any] = {key: one.pop("value") for key, one in estimates.items()}
-        document |= {
-            "failures": int(np.sum(self.column(name, "failures"))),
-            "parameters_hash": self.parameters[name],
-            "intervals": estimates,
+        """A controller's part of the summary."""
+        document: dict[str, Any] = {}
+        intervals = {}
+        for indicator in MEANS:
+            estimate = statistics.mean(self.column(name, indicator))
+            document[indicator] = estimate.value
+            intervals[indicator] = {"interval": estimate.interval}
+        document["failures"] = int(np.sum(self.column(name, "failures")))
+        document["parameters_hash"] = self.parameters[name]
+        document["intervals"] = intervals
+        if self.optimum is None:
+            return document
+        cost = self._cost(name)
+        optimal = self.optimal
+        document["regret"] = {
+            **statistics.regret(cost, optimal)._asdict(),
+            "bootstrap": statistics.bootstrapped(cost - optimal, statistics.magnitude(optimal)),
         }
-        cost, best = self._cost(name), self.optimal
-        if self.optimum is not None:
-            resampled = statistics.bootstrapped(cost - best, statistics.magnitude(best))
-            found = statistics.regret(cost, best)._asdict()
-            document["regret"] = found | {"bootstrap": resampled}
-            if NAIVE in self.controllers:
-                gap = statistics.gap_closed(cost, self._cost(NAIVE), best)
-                document["gap_closed"] = gap._asdict()
+        if NAIVE in self.controllers:
+            gap_closed = statistics.gap_closed(cost, self._cost(NAIVE), optimal)
+            document["gap_closed"] = gap_closed._asdict()
         return document
 
     def _comparison(self, name: str, reference: str) -> dict[str, Any]:
-        cost, other = self._cost(name), self._cost(reference)
-        resampled = statistics.bootstrapped(other - cost, statistics.magnitude(other))
+        """Paired differences of two controllers, for the summary."""
+        differences = {}
+        for indicator in COMPARED:
+            difference = self.column(name, indicator) - self.column(reference, indicator)
+            differences[indicator] = statistics.mean(difference)._asdict()
+        cost = self._cost(name)
+        other = self._cost(reference)
         return {
             "controller": name,
             "reference": reference,
-            "differences": {
-                key: statistics.mean(self.column(name, key) - self.column(reference, key))._asdict()
-                for key in COMPARED
+            "differences": differences,
+            "gain_in_J": {
+                **statistics.gain(cost, other)._asdict(),
+                "bootstrap": statistics.bootstrapped(other - cost, statistics.magnitude(other)),
             },
-            "gain_in_J": statistics.gain(cost, other)._asdict() | {"bootstrap": resampled},
         }
 
 
@@ -392,8 +469,15 @@ class _Recorded:
 
     name = "recorded"
 
-    def __init__(self, path: Path, states: pd.DataFrame, actions: Array) -> None:
-        self._path, self._states, self._actions = path, states, actions
+    def __init__(
+        self,
+        path: Path,
+        states: pd.DataFrame,
+        actions: Array,
+    ) -> None:
+        self._path = path
+        self._states = states
+        self._actions = actions
         self._k = -1
 
     def reset(self) -> None:
@@ -405,10 +489,11 @@ class _Recorded:
     def feedback(self, s: Array, a: object = None) -> Decision:
         """The sample's action; raises EvaluationError if the state belongs to other noise."""
         for (name, column), expected in zip(self._states.items(), s.tolist(), strict=True):
-            found = float(column.iloc[self._k])
-            if not abs(found - expected) <= TOLERANCE * (1 + abs(expected)):
+            recorded = float(column.iloc[self._k])
+            # Written so that no number is refused, too.
+            if not abs(recorded - expected) <= TOLERANCE * (1 + abs(expected)):
                 raise EvaluationError(
-                    f"'{self._path}': {name} at sample {self._k} is {found!r}; the seed's noise "
+                    f"'{self._path}': {name} at sample {self._k} is {recorded!r}; the seed's noise "
                     f"under these actions gives {expected!r} (cosim scenario NAME --seed-values K "
                     "prints the plant's start values)"
                 )
@@ -440,22 +525,38 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
         raise EvaluationError(f"'{folder}' holds no .csv file")
     runs = {path: _read(path, scenario) for path in paths}
     _check_seeds_and_lengths(runs)
-    best, rows = stored_optimum(scenario), []
-    optimum = None if best is None else build_controller(best, scenario)
+    optimum_name = stored_optimum(scenario)
+    optimum = None if optimum_name is None else build_controller(optimum_name, scenario)
+    # Runs that were played back, by what the plant did.
     played: dict[bytes, Path] = {}
-    kinds = scenario.plant
-    names = (*kinds.states, *kinds.actions, *kinds.disturbances, "stage_cost")
+    plant_table = scenario.plant
+    names = (
+        *plant_table.states,
+        *plant_table.actions,
+        *plant_table.disturbances,
+        "stage_cost",
+    )
+    rows = []
     with FmuPlant(scenario) as plant:
         for path, (seed, recorded, steps) in runs.items():
             run = simulate(plant, recorded, steps, seed, residuals=False)
+            # One run under two seeds would count twice.
             content = b"".join(run[name].tobytes() for name in names)
             other = played.setdefault(content, path)
             if other != path:
                 raise EvaluationError(f"'{path}' holds the same run as '{other}': give it once")
-            row: dict[str, Any] = {"file": path.name, "scenario": scenario.name}
-            row |= {"scenario_hash": scenario.hash, "seed": seed, "steps": steps}
             cost = np.nan if optimum is None else measure(plant, optimum, seed, steps)[0]["J"]
-            rows.append(row | indicators(run) | {"optimum": cost})
+            rows.append(
+                {
+                    "file": path.name,
+                    "scenario": scenario.name,
+                    "scenario_hash": scenario.hash,
+                    "seed": seed,
+                    "steps": steps,
+                    **indicators(run),
+                    "optimum": cost,
+                }
+            )
     table = pd.DataFrame(rows).sort_values("seed", ignore_index=True)
     table["regret"] = statistics.regrets(table.J.to_numpy(), table.optimum.to_numpy())
     return table
@@ -466,7 +567,8 @@ def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) ->
     seeds: dict[int, Path] = {}
     first = next(iter(runs))
     for path, (seed, _, steps) in runs.items():
-        if (other := seeds.setdefault(seed, path)) != path:
+        other = seeds.setdefault(seed, path)
+        if other != path:
             raise EvaluationError(f"'{path}' and '{other}' are both of seed {seed}: give one")
         if steps != runs[first][2]:
             raise EvaluationError(
@@ -476,12 +578,17 @@ def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) ->
 
 
 def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
+    """Seed, player and number of samples of a file."""
     number = re.search(r"(\d+)$", path.stem)
     if number is None:
         raise EvaluationError(f"'{path}': a file's name ends in its seed, as run-7.csv")
+    seed = int(number[1])
+    if seed >= 1 << 64:
+        raise EvaluationError(f"'{path}': its seed must be below 2⁶⁴")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.ParserWarning)  # rows of unlike length
+            # Rows of unlike length, which pandas would fill up.
+            warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(path, index_col=False)
         table = table.rename(columns=lambda title: title.partition(" [")[0].strip())
         plant = scenario.plant
@@ -489,13 +596,12 @@ def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
         if numbers.shape[1] != len(plant.states) + len(plant.actions):
             raise ValueError("two columns have one name")
     except (OSError, ValueError, KeyError, TypeError, OverflowError, Warning) as error:
-        said = " ".join(str(error).split())
-        raise EvaluationError(f"'{path}' is no trajectory: {said}") from None
+        reason = " ".join(str(error).split())
+        raise EvaluationError(f"'{path}' is no trajectory: {reason}") from None
+    # A simulation would clip them, and judge another run than the file's.
     actions = numbers[list(plant.actions)].to_numpy()
     inside = (actions >= scenario.action_lower) & (actions <= scenario.action_upper)
     if not len(actions) or not inside.all():
         k = 0 if not len(actions) else int(np.argmin(inside.all(axis=1)))
         raise EvaluationError(f"'{path}': the action at sample {k} is missing or beyond its bounds")
-    if (seed := int(number[1])) >= 1 << 64:
-        raise EvaluationError(f"'{path}': its seed must be below 2⁶⁴")
     return seed, _Recorded(path, numbers[list(plant.states)], actions), len(actions)

@@ -46,23 +46,37 @@ def depends_on(
         ControllerLookupError: a part cannot be imported.
         PlantError: the FMU cannot be read.
     """
-    data = {name: file_hash(path) or "no file" for name, path in (files or {}).items()}
+    data = {}
     for name, path in (files or {}).items():
+        data[name] = file_hash(path) or "no file"
         if _data.setdefault(str(path), data[name]) != data[name]:
             _data[str(path)] = data[name]
-            forget_users_modules()  # they may have read it while they were imported
-    found = {"versions": versions(), "rti-cosim": code_hash(), "scenario": scenario.hash}
-    found["fmu"] = unpack(scenario.plant.fmu).sha256
+            # They may have read it while they were imported.
+            forget_users_modules()
+    facts = {
+        "versions": versions(),
+        "rti-cosim": code_hash(),
+        "scenario": scenario.hash,
+        "fmu": unpack(scenario.plant.fmu).sha256,
+    }
     for part in (scenario.controller.model, scenario.plant.model, *parts):
         for module in _modules_of(part):
-            if (code := code_of(module)) is not None:
-                found[f"plug-in {module}"] = code
-    return found | data
+            code = code_of(module)
+            # None of our own modules and of Python's, which have facts of their own.
+            if code is not None:
+                facts[f"plug-in {module}"] = code
+    return facts | data
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Names of what differs between two answers of `depends_on`."""
-    return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+    """Names of what differs between two answers of `depends_on`.
+
+    Args:
+        before: an answer.
+        now: a later one.
+    """
+    names = sorted({*before, *now})
+    return [name for name in names if before.get(name) != now.get(name)]
 
 
 def _modules_of(part: Any) -> list[str]:
@@ -77,8 +91,10 @@ def _modules_of(part: Any) -> list[str]:
     module = target.partition(":")[0]
     if not TARGET.fullmatch(target) or module.partition(".")[0] in OURS:
         return []
-    found = load_plugin(target, f"'{part}'", ControllerLookupError)
-    return sorted({module, getattr(found, "__module__", None) or module})
+    plugin = load_plugin(target, f"'{part}'", ControllerLookupError)
+    # A module may only import what another one defines.
+    home = getattr(plugin, "__module__", None) or module
+    return sorted({module, home})
 
 
 def file_hash(path: str | Path) -> str:
@@ -92,11 +108,11 @@ def file_hash(path: str | Path) -> str:
 @cache
 def versions() -> str:
     """Versions of Python and of the distributions that results depend on, as one line."""
-    found = [f"python {platform.python_version()}"]
+    words = [f"python {platform.python_version()}"]
     for name in DISTRIBUTIONS:
         with suppress(PackageNotFoundError):
-            found.append(f"{name} {version(name)}")
-    return "; ".join(found)
+            words.append(f"{name} {version(name)}")
+    return "; ".join(words)
 
 
 @cache
@@ -109,7 +125,8 @@ def code_hash() -> str:
     for package in OURS:
         for path in sorted((ROOT / package).rglob("*")):
             relative = path.relative_to(ROOT)
-            if path.suffix in SUFFIXES and not ASIDE & set(relative.parts) and path.is_file():
+            counts = path.suffix in SUFFIXES and not ASIDE & set(relative.parts)
+            if counts and path.is_file():
                 digest.update(f"{relative.as_posix()}\0".encode())
                 digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:16]

@@ -23,9 +23,13 @@ Indicators = dict[str, float]
 
 
 class Noise(NamedTuple):
-    """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`.
+    """Noise that a controller is measured on.
 
-    Kept are indicators, or with `whole` every sample of the one seed's run.
+    Attributes:
+        seeds: of the noise.
+        steps: samples on each seed that count.
+        burn_in: samples before these.
+        whole: whether every sample of the one seed's run is kept, and not its indicators.
     """
 
     seeds: tuple[int, ...]
@@ -46,7 +50,12 @@ class Noise(NamedTuple):
 
 @dataclass
 class Measured:
-    """Indicators and times by noise seed; of one run kept sample by sample its `trajectory`."""
+    """What was measured.
+
+    Attributes:
+        indicators, timing: by noise seed.
+        trajectory: CSV of a run that was kept sample by sample.
+    """
 
     indicators: dict[int, Indicators] = field(default_factory=dict)
     timing: dict[int, Indicators] = field(default_factory=dict)
@@ -74,21 +83,26 @@ class MeasureItem(Item[Measured]):
 
     def run(self) -> Measured:
         """Simulate every seed."""
-        seeds, steps, burn_in, whole = self.noise
-        controller, measured = self._built(), Measured()
+        noise = self.noise
+        controller = self._built()
+        measured = Measured()
         with FmuPlant(self.plant or self.conditions.scenario) as plant:
-            if whole:
-                return Measured(trajectory=simulate(plant, controller, steps, seeds[0]).to_csv())
-            for seed in seeds:
-                found = measure(plant, controller, seed, steps, burn_in)
-                measured.indicators[seed], measured.timing[seed] = found
+            if noise.whole:
+                run = simulate(plant, controller, noise.steps, noise.seeds[0])
+                return Measured(trajectory=run.to_csv())
+            for seed in noise.seeds:
+                indicators, timing = measure(plant, controller, seed, noise.steps, noise.burn_in)
+                measured.indicators[seed] = indicators
+                measured.timing[seed] = timing
         return measured
 
     def parts(self) -> Iterator[MeasureItem]:
         """Items of about `ITEM` samples, the same ones for any number of workers."""
-        seeds, size = self.noise.seeds, max(1, ITEM // self.noise.length)
+        seeds = self.noise.seeds
+        size = max(1, ITEM // self.noise.length)
         for first in range(0, len(seeds), size):
-            yield replace(self, noise=self.noise._replace(seeds=seeds[first : first + size]))
+            noise = self.noise._replace(seeds=seeds[first : first + size])
+            yield replace(self, noise=noise)
 
     def _built(self) -> Controller:
         if isinstance(self.controller, ControllerSource) and self.controller.theta is not None:
@@ -99,14 +113,15 @@ class MeasureItem(Item[Measured]):
 
     def _with_theta(self, source: ControllerSource) -> Controller:
         """The NMPC of a θ; to build one takes as long as 8000 of its samples."""
+        # By its content, so that no other θ or code has the same key.
         key = repr((source, sorted(self.conditions.facts.items()), self.length))
         if key not in _kept:
             _kept.clear()
             controller: Any = source.build(self.conditions.scenario)
             compile_functions(controller, self.length)
             _kept[key] = controller, controller.theta
-        controller, own = _kept[key]
-        controller.theta = np.array(self.theta) if self.theta else own
+        controller, theta = _kept[key]
+        controller.theta = np.array(self.theta) if self.theta else theta
         return controller  # type: ignore[no-any-return]
 
 
@@ -115,7 +130,12 @@ _kept: dict[str, tuple[Any, Any]] = {}
 
 
 def built(controller: ControllerSource | Factory, scenario: Scenario) -> Controller:
-    """The controller for a scenario; raises what building it raises."""
+    """The controller for a scenario; raises what building it raises.
+
+    Args:
+        controller: its content, or a factory.
+        scenario: what it controls.
+    """
     if isinstance(controller, ControllerSource):
         return controller.build(scenario)
     return controller(scenario)

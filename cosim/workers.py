@@ -72,25 +72,33 @@ class Conditions:
     def of_now(
         cls, scenario: Scenario, *parts: Any, files: Mapping[str, str] | None = None
     ) -> Self:
-        """The conditions as this process finds them now; raises what `depends_on` raises."""
+        """The conditions as this process finds them now; raises what `depends_on` raises.
+
+        Args:
+            scenario: of the work.
+            parts: controllers and algorithms that count.
+            files: paths of the data files that count, by name.
+        """
         if is_file(scenario.plant.fmu):
             fmu = str(Path(scenario.plant.fmu).resolve())
             scenario = scenario.replace({"plant": {"fmu": fmu}})
         facts = depends_on(scenario, *parts, files=files)
         return cls(scenario, facts, parts, files or {}, import_folders())
 
-    def found_here(self) -> dict[str, str]:
-        """What this process finds in the place of `facts`."""
+    def facts_here(self) -> dict[str, str]:
+        """What this process has in the place of `facts`."""
         for folder in self.folders:
             import_from(folder)
         return depends_on(self.scenario, *self.parts, files=self.files)
 
-    def refusal(self, found: Mapping[str, str]) -> Failure | None:
-        """The failure of a worker that has found other things than planned; None if it has not."""
-        names = changed(self.facts, found)
+    def refusal(self, facts: Mapping[str, str]) -> Failure | None:
+        """The failure of a worker that met other things than planned; None if it did not."""
+        names = changed(self.facts, facts)
         if not names:
             return None
-        seen = [f"{name} ({found.get(name)}, not {self.facts.get(name)})" for name in names]
+        seen = []
+        for name in names:
+            seen.append(f"{name} ({facts.get(name)}, not {self.facts.get(name)})")
         if "fmu" in names:
             seen.append(f"the FMU is '{self.scenario.plant.fmu}'")
         message = (
@@ -113,35 +121,44 @@ class Item(Generic[Result]):
 
 @dataclass(frozen=True)
 class Report(Generic[Result]):
-    """What a worker says of an item: what it ran with, and the result or the failure."""
+    """What a worker says of an item.
 
-    found: Mapping[str, str]
+    Attributes:
+        facts: what it ran with.
+        result: of the item, or its failure.
+    """
+
+    facts: Mapping[str, str]
     result: Result | Failure
 
 
 def perform(item: Item[Result]) -> Report[Result]:
     """Do an item in this process; any exception, `sys.exit` too, becomes a Failure."""
-    found: Mapping[str, str] = {}
+    facts: Mapping[str, str] = {}
     try:
-        found = item.conditions.found_here()
-        if (refusal := item.conditions.refusal(found)) is not None:
-            return Report(found, refusal)
+        facts = item.conditions.facts_here()
+        refusal = item.conditions.refusal(facts)
+        if refusal is not None:
+            return Report(facts, refusal)
         result = item.run()
         # Data files and plug-ins may have been edited meanwhile.
-        return Report(item.conditions.found_here(), result)
+        return Report(item.conditions.facts_here(), result)
     except (KeyboardInterrupt, Terminated):
         raise
     except BaseException as error:
-        text = " ".join(f"{error}".split()) or type(error).__name__
-        kind = type(error) if isinstance(error, Exception) else None
-        if kind is not None and kind.__module__.partition(".")[0] not in OURS:
-            kind = None
-        message = f"{type(error).__name__}: {text}"
-        return Report(found, Failure(message, traceback.format_exc(), kind))
+        name = type(error).__name__
+        text = " ".join(f"{error}".split()) or name
+        kind: type[Exception] | None = None
+        # Classes of others need not be there where the error is raised again.
+        if isinstance(error, Exception) and type(error).__module__.partition(".")[0] in OURS:
+            kind = type(error)
+        return Report(facts, Failure(f"{name}: {text}", traceback.format_exc(), kind))
 
 
 def done(
-    items: Mapping[Key, Item[Result]], jobs: int, scheduler: str | None
+    items: Mapping[Key, Item[Result]],
+    jobs: int,
+    scheduler: str | None,
 ) -> Iterator[tuple[Key, Result | Failure]]:
     """Do items; yield the key of each with its result as it ends, in no certain order.
 
@@ -160,17 +177,19 @@ def done(
         EvaluationError: no worker can work.
     """
     jobs = whole_number("jobs", jobs, 1, EvaluationError)
-    left, fruitless = dict(items), 0
+    left = dict(items)
+    fruitless = 0
     while left:
         fruitless += 1
         try:
             with closing(_reports(left, jobs, scheduler)) as reports:
                 for key, report in reports:
-                    conditions, fruitless = left.pop(key).conditions, 0
+                    conditions = left.pop(key).conditions
+                    fruitless = 0
                     if isinstance(report.result, Failure):
                         yield key, report.result
                     else:
-                        yield key, conditions.refusal(report.found) or report.result
+                        yield key, conditions.refusal(report.facts) or report.result
         except BrokenProcessPool as error:
             if fruitless == ROUNDS:
                 raise EvaluationError(
@@ -191,7 +210,9 @@ def _with_key(key: Key, item: Item[Result]) -> tuple[Key, Report[Result]]:
 
 
 def _reports(
-    items: Mapping[Key, Item[Result]], jobs: int, scheduler: str | None
+    items: Mapping[Key, Item[Result]],
+    jobs: int,
+    scheduler: str | None,
 ) -> Generator[tuple[Key, Report[Result]], None, None]:
     """Reports of items by key, in no certain order."""
     if scheduler is not None:
@@ -200,6 +221,7 @@ def _reports(
     if jobs == 1:
         yield from (_with_key(key, item) for key, item in list(items.items()))
         return
+    # The workers are as many as the cores: more threads would wait for each other.
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     workers = loky.ProcessPoolExecutor(
         min(jobs, len(items)), initializer=begin, initargs=(os.getpid(),), env=one_thread
@@ -229,7 +251,8 @@ def _on_cluster(
         ) from None
     ended: SimpleQueue[Any] = SimpleQueue()
     level = logging.root.manager.disable
-    logging.disable()  # the exception says what went wrong, once
+    # The exception says what went wrong, once.
+    logging.disable()
     try:
         # Ask the address first: a client made where nobody answers can hang when it ends.
         if _identity(dask, address).get("type") != "Scheduler":
@@ -245,16 +268,20 @@ def _on_cluster(
                 client.close(timeout=ANSWER_SECONDS)
     except Exception as error:
         text = f"no answer within {ANSWER_SECONDS:g} s" if type(error) is TimeoutError else error
-        said = " ".join(str(text).split())[:300] or type(error).__name__
+        reason = " ".join(str(text).split())[:300] or type(error).__name__
         raise EvaluationError(
-            f"the Dask cluster at '{address}' failed: {said}; give the same command again, with "
+            f"the Dask cluster at '{address}' failed: {reason}; give the same command again, with "
             "the same rti-cosim and what the items need on all workers"
         ) from None
     finally:
         logging.disable(level)
 
 
-def _next_ended(dask: Any, address: str, ended: SimpleQueue[Any]) -> Any:
+def _next_ended(
+    dask: Any,
+    address: str,
+    ended: SimpleQueue[Any],
+) -> Any:
     """The next future that has ended; raises OSError where there is no worker for long."""
     waited = 0.0
     while True:

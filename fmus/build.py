@@ -133,7 +133,10 @@ class Compiler:
         return result.stdout.splitlines()[0]
 
     def library(
-        self, sources: Mapping[str, bytes], name: str, warnings: tuple[str, ...] = WARNINGS
+        self,
+        sources: Mapping[str, bytes],
+        name: str,
+        warnings: tuple[str, ...] = WARNINGS,
     ) -> bytes:
         """Compile every ``*.c`` of the sources into one shared library.
 
@@ -267,14 +270,18 @@ def _libraries(
 ) -> dict[Platform, bytes]:
     """The shared library of each platform, all compiled at once."""
     with ThreadPoolExecutor(len(compilers)) as pool:
-        running = {
-            compiler.platform: pool.submit(compiler.library, sources, identifier, warnings)
-            for compiler in compilers
-        }
-        return {platform: future.result() for platform, future in running.items()}
+        futures = {}
+        for compiler in compilers:
+            future = pool.submit(compiler.library, sources, identifier, warnings)
+            futures[compiler.platform] = future
+        return {platform: future.result() for platform, future in futures.items()}
 
 
-def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
+def build_folder(
+    folder: str | Path,
+    target: str | Path,
+    every_platform: bool = False,
+) -> Path:
     """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into an FMU.
 
     Args:
@@ -303,8 +310,10 @@ def _model(description: bytes) -> tuple[str, str]:
     version = root.get("fmiVersion", "")
     if version[:2] not in ("2.", "3."):
         raise BuildError(f"modelDescription.xml is for FMI {version or '?'}, not 2.0 or 3.0")
-    faces = [face for tag in ("CoSimulation", "ModelExchange") for face in root.findall(tag)]
-    identifiers = {face.get("modelIdentifier", "") for face in faces}
+    identifiers = set()
+    for tag in ("CoSimulation", "ModelExchange"):
+        for interface in root.findall(tag):
+            identifiers.add(interface.get("modelIdentifier", ""))
     if len(identifiers) != 1:
         raise BuildError(
             "modelDescription.xml: CoSimulation and ModelExchange must name one modelIdentifier, "
@@ -420,7 +429,11 @@ def build_model(
     )
 
 
-def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
+def token_of(
+    model: FmuModel,
+    version: FmiVersion,
+    sources: Mapping[str, bytes],
+) -> str:
     """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model.
 
     Args:
@@ -451,8 +464,11 @@ def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:
     known = tuple(signal.name for signal in signals if signal.settable)
     for signal in signals:
         table.append(signal if signal.settable else replace(signal, uses=known))
-    for names in ([v.name for v in table], [v.identifier for v in table]):
-        for name in names:
-            if names.count(name) > 1:
+    # In C a name has other signs, so that two names may meet there.
+    names = [variable.name for variable in table]
+    identifiers = [variable.identifier for variable in table]
+    for known_names in (names, identifiers):
+        for name in known_names:
+            if known_names.count(name) > 1:
                 raise BuildError(f"two variables are called '{name}'")
     return tuple(table)

@@ -21,9 +21,18 @@ _INTERFACES = {
     "ScheduledExecution": "scheduled execution",
 }
 _VARIABLE = (
-    "name", "valueReference", "type", "causality", "variability", "unit", "start", "min", "max",
+    "name",
+    "valueReference",
+    "type",
+    "causality",
+    "variability",
+    "unit",
+    "start",
+    "min",
+    "max",
     "description",
-)  # fmt: skip
+)
+"""What is said of a variable."""
 
 
 def description_of(fmu: Path) -> ModelDescription:
@@ -37,46 +46,60 @@ def description_of(fmu: Path) -> ModelDescription:
 
 
 def information(fmu: Path, description: ModelDescription | None = None) -> dict[str, Any]:
-    """The description of the file `fmu`; raises FmuError when it is missing or is no FMU.
+    """The description of an FMU as words and numbers.
 
     ``flags`` are the capability flags that each interface states, by its name in words;
     ``platforms`` are the folders under ``binaries/`` with what their libraries are made for by
-    their own first bytes, and ``c-code`` for sources. `description` is that of the file where it
-    has been read already: a large one takes seconds.
+    their own first bytes, and ``c-code`` for sources.
+
+    Args:
+        fmu: the file.
+        description: of the file, where it has been read already: a large one takes seconds.
+
+    Raises:
+        FmuError: the file is missing or is no FMU.
     """
-    about = description or description_of(fmu)
+    model = description or description_of(fmu)
+    platforms: dict[str, tuple[str, ...]] = {}
     with zipfile.ZipFile(fmu) as container:
-        names = {entry.filename.replace("\\", "/"): entry for entry in container.infolist()}
-        root = etree.fromstring(container.read(names["modelDescription.xml"]))
-        platforms = {
-            name.split("/")[1]: platforms_of(container.read(entry)) or ("not a library",)
-            for name, entry in sorted(names.items())
-            if re.fullmatch(r"binaries/[^/]+/[^/]+\.(so|dll|dylib)", name)
-        }
-    if any(name.startswith("sources/") and name.endswith(".c") for name in names):
-        platforms["c-code"] = ()
-    flags = {
-        words: {key: value for key, value in face.attrib.items() if key != "modelIdentifier"}
-        for tag, words in _INTERFACES.items()
-        if (face := root.find(tag)) is not None
-    }
-    times = {"start_time": "startTime", "stop_time": "stopTime", "step_size": "stepSize"}
-    stated = {key: getattr(about.defaultExperiment, name, None) for key, name in times.items()}
+        # Some tools on Windows write backslashes.
+        entries = {entry.filename.replace("\\", "/"): entry for entry in container.infolist()}
+        root = etree.fromstring(container.read(entries["modelDescription.xml"]))
+        for name, entry in sorted(entries.items()):
+            if re.fullmatch(r"binaries/[^/]+/[^/]+\.(so|dll|dylib)", name):
+                made_for = platforms_of(container.read(entry))
+                platforms[name.split("/")[1]] = made_for or ("not a library",)
+    for name in entries:
+        if name.startswith("sources/") and name.endswith(".c"):
+            platforms["c-code"] = ()
+    flags = {}
+    for tag, words in _INTERFACES.items():
+        element = root.find(tag)
+        if element is not None:
+            attributes = dict(element.attrib)
+            attributes.pop("modelIdentifier", None)
+            flags[words] = attributes
+    experiment = model.defaultExperiment
+    variables = []
+    for variable in model.modelVariables:
+        variables.append({name: getattr(variable, name) for name in _VARIABLE})
     return {
         "path": str(fmu),
         "sha256": hashlib.sha256(fmu.read_bytes()).hexdigest(),
-        "fmi_version": about.fmiVersion,
-        "name": about.modelName,
-        "description": about.description or "",
+        "fmi_version": model.fmiVersion,
+        "name": model.modelName,
+        "description": model.description or "",
         "interfaces": list(flags),
         "platforms": platforms,
         "flags": flags,
-        **{key: _number(value) for key, value in stated.items()},
-        "variables": [{n: getattr(v, n) for n in _VARIABLE} for v in about.modelVariables],
+        "start_time": _optional_number(getattr(experiment, "startTime", None)),
+        "stop_time": _optional_number(getattr(experiment, "stopTime", None)),
+        "step_size": _optional_number(getattr(experiment, "stepSize", None)),
+        "variables": variables,
     }
 
 
-def _number(stated: str | None) -> float | None:
+def _optional_number(stated: str | None) -> float | None:
     """A number of the description; None where it states none, or a text that is no number."""
     try:
         return None if stated is None else float(stated)
@@ -90,7 +113,8 @@ class NotOfferedError(FmuError):
 
 def validate(fmu: Path) -> str:
     """Schema, names, model structure, start values and units; raises CheckError on a problem."""
-    if problems := problems_of(fmu):
+    problems = problems_of(fmu)
+    if problems:
         raise CheckError("; ".join(problems))
     return "no problem found"
 
@@ -107,6 +131,6 @@ def declared_variables(fmu: Path) -> str:
         raise NotOfferedError("the FMU has neither co-simulation nor model exchange")
     names = [variable.name for variable in description.modelVariables]
     stated = getattr(description.defaultExperiment, "stepSize", None)
-    step = _number(stated) or 1.0
+    step = _optional_number(stated) or 1.0
     fmpy.simulate_fmu(str(fmu), output=names, start_time=0.0, stop_time=step, output_interval=step)
     return f"{len(names)} read"

@@ -65,7 +65,7 @@ def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
     return (json.dumps(record, indent=2) + "\n").encode()
 
 
-def build(folder: Path, every_platform: bool = False) -> list[Path]:
+def build_evaporator(folder: Path, every_platform: bool = False) -> list[Path]:
     """Build both FMUs of the evaporator.
 
     Args:
@@ -139,11 +139,17 @@ def compare_with_shipped() -> dict[str, list[str]]:
     """Build anew for every platform; file name → `differences` from the shipped file."""
     with TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as name:
         folder = Path(name).absolute()
-        built = [*build(folder, every_platform=True), *plant.build(folder, every_platform=True)]
+        built = [
+            *build_evaporator(folder, every_platform=True),
+            *plant.build_shipped_plants(folder, every_platform=True),
+        ]
         return {path.name: differences(path, PACKAGE / path.name) for path in built}
 
 
 def build_in_place() -> list[Path]:
     """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
     (SOURCES / HEADER).write_bytes(sources_of(EVAPORATOR, 2)[HEADER])
-    return [*build(PACKAGE, every_platform=True), *plant.build(PACKAGE, every_platform=True)]
+    return [
+        *build_evaporator(PACKAGE, every_platform=True),
+        *plant.build_shipped_plants(PACKAGE, every_platform=True),
+    ]

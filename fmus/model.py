@@ -238,6 +238,7 @@ def closure(name: str, model: FmuModel) -> frozenset[str]:
         model: the table that it is in.
     """
     names: set[str] = set()
+    # A state is known at every instant; what it depends on acts through its derivative.
     for used in model.by_name[name].uses:
         names.add(used)
         if model.by_name[used].kind in (Kind.OUTPUT, Kind.DERIVATIVE):
@@ -268,7 +269,8 @@ def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
     direct = closure(name, model)
     names = set(direct)
     for known in direct:
-        if model.by_name[known].kind is Kind.STATE:  # which depends on its start parameter
+        # A state depends on its start parameter.
+        if model.by_name[known].kind is Kind.STATE:
             names |= closure(known, model)
     return tuple(v.name for v in model.variables if v.name in names and v.settable)
 
@@ -299,9 +301,10 @@ def _template(name: str) -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {
-        "attributes": _attributes, "html": html.escape, "number": _number, "xml": _xml,
-    }  # fmt: skip
+    environment.filters["attributes"] = _attributes
+    environment.filters["html"] = html.escape
+    environment.filters["number"] = _number_text
+    environment.filters["xml"] = _xml
     return environment.get_template(name)
 
 
@@ -318,7 +321,7 @@ def _attributes(values: Attributes) -> str:
     return text
 
 
-def _number(value: float) -> str:
+def _number_text(value: float) -> str:
     """Shortest text that reads back to `value`; integers without a fraction."""
     return repr(float(value)).removesuffix(".0")
 
@@ -334,7 +337,11 @@ _CAUSALITY = {
 }
 
 
-def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
+def model_description(
+    version: FmiVersion,
+    token: str,
+    model: FmuModel,
+) -> str:
     """The text of modelDescription.xml.
 
     Args:
@@ -344,7 +351,8 @@ def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
     """
     if model.units:
         unit_names = list(model.units)
-    else:  # each once, in the order of the table
+    else:
+        # Once, in the order of the table.
         unit_names = list(dict.fromkeys(v.unit for v in model.variables if v.unit))
     variables = []
     for variable in model.exported(version):
@@ -399,7 +407,11 @@ def _common_attributes(variable: Variable, model: FmuModel) -> Attributes:
     }
 
 
-def _type(version: FmiVersion, variable: Variable, model: FmuModel) -> tuple[str, Attributes]:
+def _type(
+    version: FmiVersion,
+    variable: Variable,
+    model: FmuModel,
+) -> tuple[str, Attributes]:
     """The element of a variable's type and its attributes."""
     match variable.type:
         case Type.BOOLEAN:
@@ -417,13 +429,18 @@ def _type(version: FmiVersion, variable: Variable, model: FmuModel) -> tuple[str
             return element, _real_attributes(version, variable, model)
 
 
-def _real_attributes(version: FmiVersion, variable: Variable, model: FmuModel) -> Attributes:
+def _real_attributes(
+    version: FmiVersion,
+    variable: Variable,
+    model: FmuModel,
+) -> Attributes:
     attributes: dict[str, object] = {"unit": variable.unit or None}
     for key in ("min", "max", "nominal", "start"):
         value = getattr(variable, key)
-        no_nominal = key == "nominal" and value == 0.0  # which FMI forbids
-        if value is not None and not no_nominal:
-            attributes[key] = float(value)
+        # FMI forbids a nominal value of zero.
+        if value is None or (key == "nominal" and value == 0.0):
+            continue
+        attributes[key] = float(value)
     if variable.start is not None and variable.name in model.arrays:
         elements = model.arrays[variable.name]
         attributes["start"] = " ".join(str(float(v.start or 0.0)) for v in elements)
@@ -499,11 +516,11 @@ def c_header(token: str, model: FmuModel) -> str:
         layout=hashlib.sha256(names.encode()).hexdigest()[:16],
         types=list(Type.__members__),
         kinds=list(Kind.__members__),
-        numbers=partial(_numbers, sys.float_info.max if model.sampled else 0.0),
+        numbers=partial(_start_and_range, sys.float_info.max if model.sampled else 0.0),
     )
 
 
-def _numbers(most: float, variable: Variable) -> tuple[float, ...]:
+def _start_and_range(most: float, variable: Variable) -> tuple[float, ...]:
     """Start, range and nominal value as the C has them; without a range it is −`most` to `most`."""
     low = -most if variable.min is None else variable.min
     high = most if variable.max is None else variable.max

@@ -192,7 +192,7 @@ def build_plant(
     return build_model(complete, target, version, every_platform=every_platform)
 
 
-PLANTS = {
+SHIPPED_PLANTS = {
     "reactor": ("Exothermic stirred-tank reactor with disturbed feed", 12.0),
     # Johansson (2000)
     "tanks": ("Quadruple tank with water drawn at random from the lower tanks", 5.0),
@@ -202,7 +202,7 @@ _ROLES = ("states", "inputs", "disturbances", "outputs", "parameters")
 
 
 def model(name: str) -> FmuModel:
-    """The table of a plant of `PLANTS`."""
+    """The table of a plant of `SHIPPED_PLANTS`."""
     signals: dict[str, list[Signal]] = {role: [] for role in _ROLES}
     with (RESOURCES / f"{name}.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -216,7 +216,7 @@ def model(name: str) -> FmuModel:
                 range=float(row["range"] or 0.0),
             )
             signals[row["role"]].append(signal)
-    description, sampling_time = PLANTS[name]
+    description, sampling_time = SHIPPED_PLANTS[name]
     return plant_model(name, description=description, sampling_time=sampling_time, **signals)
 
 
@@ -225,8 +225,8 @@ def equations(name: str) -> bytes:
     return (PACKAGE / "equations" / f"{name}.h").read_bytes()
 
 
-def build(folder: Path, every_platform: bool = False) -> list[Path]:
-    """Build the FMUs (FMI 2.0) of `PLANTS`.
+def build_shipped_plants(folder: Path, every_platform: bool = False) -> list[Path]:
+    """Build the FMUs (FMI 2.0) of `SHIPPED_PLANTS`.
 
     Args:
         folder: where they are written.
@@ -236,7 +236,7 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
         Their paths.
     """
     built = []
-    for name in PLANTS:
+    for name in SHIPPED_PLANTS:
         target = folder / f"{name}.fmu"
         built.append(build_plant(model(name), equations(name), target, 2, every_platform))
     return built

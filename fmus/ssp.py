@@ -99,7 +99,11 @@ def _base_units(description: ModelDescription) -> dict[str, dict[str, float]]:
     return units
 
 
-def _connection(source: str, sink: str, signal: str) -> dict[str, tuple[str, str]]:
+def _connection(
+    source: str,
+    sink: str,
+    signal: str,
+) -> dict[str, tuple[str, str]]:
     """A connection of two components' connectors of one name."""
     return {"start": (source, signal), "end": (sink, signal)}
 

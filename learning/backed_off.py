@@ -5,7 +5,7 @@ It comes from the controller's own model alone, without a sample of the plant.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -16,16 +16,15 @@ from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.core.protocols import Array
+from cosim.core.loop import ClosedLoop, Sample
+from cosim.core.protocols import Array, Step
 from cosim.core.scenario import Scenario
-from cosim.core.simulation import recover
 from learning.algorithm import Transition
 from learning.back_off import BackOffConfiguration, BackOffSearch
 from learning.prediction_errors import OneStepModel
 
-Sample = Callable[[RtiNmpc, Array, np.random.Generator], Transition]
-"""A sample of a controller on its own model, from a state (n,), with guessed noise."""
 _searched: dict[tuple[str, str, float, int], Parameters] = {}
+"""θ that this process has searched already, by scenario, start, deviation and samples."""
 
 
 def backed_off(scenario: Scenario) -> RtiNmpc:
@@ -61,25 +60,19 @@ def back_off(
     key = (scenario.hash, start.hash, deviation, samples)
     if key in _searched:
         return _searched[key]
-    sample = _simulation(scenario, deviation)
+    plant = GuessedPlant(scenario, deviation)
     controller = nmpc(scenario, start)
+    loop = ClosedLoop(plant.step, controller, scenario)
     rng = np.random.default_rng(0)
     search = BackOffSearch(start, scenario, samples, rng, BackOffConfiguration.from_dict({}))
     while not search.has_ended:
-        # A segment begins at the initial state; all of a round meet the same noise.
-        noise = np.random.default_rng(search.seed)
-        controller.reset()
         controller.theta = search.trial.theta
-        s = scenario.initial_state
+        # A segment begins at the initial state; all of a round meet the same noise.
+        loop.start(plant.reset(search.seed))
         segment_has_ended = False
         while not segment_has_ended:
-            transition: Transition | None = None
-            try:
-                transition = sample(controller, s, noise)
-                s = transition.next_s
-            except Exception as error:
-                recover(controller, error)
-            segment_has_ended = search.observe(transition)
+            sample = loop.advance()
+            segment_has_ended = search.observe(_transition(sample, scenario))
     _searched[key] = search.theta
     return search.theta
 
@@ -103,16 +96,15 @@ def add_reserve(
         reserve: the back-off, in standard deviations of the one-step error.
         samples: of the simulation.
     """
-    controller = nmpc(scenario, start)
-    sample = _simulation(scenario, deviation)
-    noise = np.random.default_rng(0)
-    s = scenario.initial_state
+    plant = GuessedPlant(scenario, deviation)
+    loop = ClosedLoop(plant.step, nmpc(scenario, start), scenario)
+    loop.start(plant.reset(0))
     transitions = []
     # One run: where do the states go, and which bounds are active?
     for _ in range(samples):
-        transition = sample(controller, s, noise)
-        transitions.append(transition)
-        s = transition.next_s
+        transition = _transition(loop.advance(), scenario)
+        if transition is not None:
+            transitions.append(transition)
     states = np.array([transition.s for transition in transitions])
     actions = np.array([transition.a for transition in transitions])
     next_states = np.array([transition.next_s for transition in transitions])
@@ -133,46 +125,67 @@ def add_reserve(
     )
 
 
-def _simulation(scenario: Scenario, deviation: float) -> Sample:
-    """A function that takes a sample of a controller on its own model."""
-    problem = Problem.from_scenario(scenario)
-    model = problem.model
-    x, u, d, _ = model.symbols()
-    p = ca.SX(ca.DM(model.nominal_parameters))
-    next_x = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
-    results = {"y": next_x, "l": ca.SX(model.economic_cost(x, u, d, p))}
-    plant = StackedFunction("f", {"x": x, "u": u, "d": d}, results)
-    nominal = model.nominal_disturbance
+class GuessedPlant:
+    """The controller's own model as a plant, its disturbances normal about their nominal values.
 
-    def sample(
-        controller: RtiNmpc,
-        s: Array,
-        noise: np.random.Generator,
-    ) -> Transition:
-        controller.prepare()
-        solution = controller.feedback(s)
-        a = scenario.saturate(solution.action)
-        plant.inputs["x"][:] = s
-        plant.inputs["u"][:] = a
-        # In proportion to their values: no scenario says more on the first day.
-        plant.inputs["d"][:] = nominal * (1.0 + deviation * noise.standard_normal(nominal.size))
-        plant()
-        next_s = plant.part("y").copy()
-        stage_cost = float(plant.part("l")[0])
-        return Transition(
-            number=0,
-            s=s,
-            a=a,
-            explored=False,
-            solution=solution,
-            q_solution=solution,
-            stage_cost=stage_cost,
-            cost=stage_cost + scenario.state_penalty(s.tolist()),
-            next_s=next_s,
-            next_penalty=scenario.state_penalty(next_s.tolist()),
-            next_solution=solution,
-            point=None,
-            next_point=None,
-        )
+    Args:
+        scenario: names the model.
+        deviation: standard deviation of each disturbance, as a share of its nominal value: no
+            scenario says more on the first day.
+    """
 
-    return sample
+    def __init__(self, scenario: Scenario, deviation: float) -> None:
+        problem = Problem.from_scenario(scenario)
+        model = problem.model
+        x, u, d, _ = model.symbols()
+        p = ca.SX(ca.DM(model.nominal_parameters))
+        next_x = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
+        results = {"y": next_x, "l": ca.SX(model.economic_cost(x, u, d, p))}
+        self.scenario = scenario
+        self._deviation = deviation
+        self._function = StackedFunction("f", {"x": x, "u": u, "d": d}, results)
+        self._nominal = model.nominal_disturbance
+        self.reset(0)
+
+    def reset(self, seed: int) -> Array:
+        """Start again from the scenario's initial state, with the noise of a seed; the state."""
+        self._rng = np.random.default_rng(seed)
+        self._s = self.scenario.initial_state
+        return self._s
+
+    def step(self, a: Array) -> Step:
+        """Hold the action a (m,) for one sampling time."""
+        s = self._s
+        function = self._function
+        noise = self._rng.standard_normal(self._nominal.size)
+        d = self._nominal * (1.0 + self._deviation * noise)
+        function.inputs["x"][:] = s
+        function.inputs["u"][:] = a
+        function.inputs["d"][:] = d
+        function()
+        self._s = function.part("y").copy()
+        stage_cost = float(function.part("l")[0])
+        return Step(self._s, stage_cost, self.scenario.state_penalty(s.tolist()), d)
+
+
+def _transition(sample: Sample, scenario: Scenario) -> Transition | None:
+    """What a search reads of a greedy sample; None after a failed solve."""
+    solution: Any = sample.solution
+    if solution is None:
+        return None
+    step = sample.step
+    return Transition(
+        number=0,
+        s=sample.s,
+        a=sample.a,
+        explored=False,
+        solution=solution,
+        q_solution=solution,
+        stage_cost=step.stage_cost,
+        cost=step.stage_cost + step.penalty,
+        next_s=step.s,
+        next_penalty=scenario.state_penalty(step.s.tolist()),
+        next_solution=solution,
+        point=None,
+        next_point=None,
+    )

@@ -11,9 +11,9 @@ import numpy as np
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
+from cosim.core.loop import ClosedLoop
 from cosim.core.protocols import Plant, Step, Vector
 from cosim.core.scenario import Scenario
-from cosim.core.simulation import recover
 from cosim.plant import FmuPlant
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
@@ -64,9 +64,8 @@ class Counts:
 class TrainingLoop:
     """Takes samples from a plant and lets a rule move the controller's θ.
 
-    V(s₊) of a sample is V(s) of the next one, so a greedy sample costs one QP. Where the controller
-    fails, the last action is applied once more, the failure is counted and the controller starts
-    from its reference.
+    The loop is `cosim.core.loop.ClosedLoop`; this one chooses its actions and counts its failures.
+    V(s₊) of a sample is V(s) of the next one, so a greedy sample costs one QP.
 
     Args:
         plant: has been reset; a rule that requires `operation` gets it as a `PlantInOperation`.
@@ -91,10 +90,11 @@ class TrainingLoop:
         scenario = plant.scenario
         # A rule in operation cannot reach the plant, not even by an attribute.
         self._simulator: Any = None
-        self._plant: FmuPlant | PlantInOperation = PlantInOperation(plant)
+        in_operation: FmuPlant | PlantInOperation = PlantInOperation(plant)
         if algorithm.requires == "simulator":
             self._simulator = plant
-            self._plant = plant
+            in_operation = plant
+        self._loop = ClosedLoop(in_operation.step, controller, scenario, keeps_points=True)
         self.controller = controller
         self.algorithm = algorithm
         self.rng = rng
@@ -102,20 +102,18 @@ class TrainingLoop:
         self._strategy = strategy
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
-        self._lower = scenario.action_lower
-        self._upper = scenario.action_upper
         self._penalty = scenario.state_penalty
-        self._applied = scenario.reference_action
-        self._solution: RtiSolution | None = None
-        self._point: LinearisationPoint | None = None
-        self.s: Vector = scenario.initial_state
         self.counts = Counts()
 
     def start(self, s: Vector) -> None:
         """Begin an episode at the state s (n,) to which the plant has been reset."""
-        self.s = s
-        self.controller.reset()
-        self._solution = self._solve(self.s, prepare=True)
+        self._loop.start(s)
+        self._solve()
+
+    @property
+    def s(self) -> Vector:
+        """Present state, (n,)."""
+        return self._loop.s
 
     @property
     def parameters(self) -> Parameters:
@@ -161,9 +159,9 @@ class TrainingLoop:
 
     def renew(self) -> None:
         """Solve again for the present state at the same linearisation point, after θ has moved."""
-        if self._point is not None:
-            self.controller.prepare_at(self._point)
-            self._solution = self._solve(self.s)
+        if self._loop.point is not None:
+            self.controller.prepare_at(self._loop.point)
+            self._solve(prepare=False)
 
     def next(self) -> tuple[Transition | None, float]:
         """One sample of the plant.
@@ -171,62 +169,59 @@ class TrainingLoop:
         Returns:
             Its transition, None after a failure, and its share of J.
         """
-        solution = self._solution
-        point = self._point
-        s = self.s
+        loop = self._loop
+        solution: RtiSolution | None = loop.solution
+        point: LinearisationPoint | None = loop.point
         number = self.counts.number
         a, explored = self._choose(solution)
         # V and Q are one where a = π(s): a greedy sample costs one QP.
         q_solution = solution
         if explored and self.algorithm.needs_q_solution:
-            q_solution = self._solve(s, a)
+            q_solution = loop.solve_for(a)
+            self.counts.failures += q_solution is None
         if solution is not None and number % FLAGS_EVERY == 0:
             self.counts.weakly_active += solution.weakly_active
             self.counts.licq_failed += not solution.licq
-        step = self._plant.step(a)
-        # A rule reads what was measured, and changes nothing.
-        for array in (s, a, step.s, step.disturbance):
-            array.flags.writeable = False
-        # The solution at s₊ serves the next sample too.
-        self._applied = a
-        self.s = step.s
+        sample = loop.step(a)
         self.counts.number = number + 1
-        self._solution = self._solve(self.s, prepare=True)
+        # The solution at s₊ serves the next sample too.
+        self._solve()
+        next_solution: RtiSolution | None = loop.solution
+        step = sample.step
         cost = step.stage_cost + step.penalty
-        if solution is None or q_solution is None or self._solution is None:
+        if solution is None or q_solution is None or next_solution is None:
             return None, cost
         needs_points = self.algorithm.needs_points
         transition = Transition(
             number=number,
-            s=s,
+            s=sample.s,
             a=a,
             explored=explored,
             solution=solution,
             q_solution=q_solution,
             stage_cost=step.stage_cost,
             cost=cost,
-            next_s=self.s,
-            next_penalty=self._penalty(self.s.tolist()),
-            next_solution=self._solution,
+            next_s=step.s,
+            next_penalty=self._penalty(step.s.tolist()),
+            next_solution=next_solution,
             point=point if needs_points else None,
-            next_point=self._point if needs_points else None,
+            next_point=loop.point if needs_points else None,
         )
         return transition, cost
 
     def _choose(self, solution: RtiSolution | None) -> tuple[Vector, bool]:
         """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
-        if solution is None:
-            return self._applied, False
-        exploring: Vector | None = None
-        if not self.has_ended and getattr(self.algorithm, "explores", True):
-            exploring = self._strategy(solution.action, self.rng)
-        wanted = solution.action if exploring is None else exploring
-        # The QP keeps bounds to its tolerance, the actuator exactly.
-        a = np.clip(wanted, self._lower, self._upper)
-        if exploring is None:
-            return a, False
+        loop = self._loop
+        explores = not self.has_ended and getattr(self.algorithm, "explores", True)
+        # After a failed solve there is no action to explore about.
+        if solution is None or not explores:
+            return loop.action(), False
+        wanted = self._strategy(solution.action, self.rng)
+        if wanted is None:
+            return loop.action(), False
+        a = loop.saturate(wanted)
         self.counts.explored += 1
-        at_bound = (a == self._lower) | (a == self._upper)
+        at_bound = (a == loop.lower) | (a == loop.upper)
         self.counts.saturated += bool(at_bound.any())
         return a, True
 
@@ -239,25 +234,9 @@ class TrainingLoop:
             )
         return self._simulator
 
-    def _solve(
-        self,
-        s: Vector,
-        a: Vector | None = None,
-        *,
-        prepare: bool = False,
-    ) -> RtiSolution | None:
-        """V(s) and π(s), or Q(s, a); None after a failure, which is counted."""
-        try:
-            if prepare:
-                self.controller.prepare()
-                self._point = self.controller.linearisation_point
-            return self.controller.feedback(s, a)
-        except Exception as error:
-            recover(self.controller, error)
-        # Without a linearisation point the next sample begins at the reference.
-        self.counts.failures += 1
-        self._point = None
-        return None
+    def _solve(self, *, prepare: bool = True) -> None:
+        """Solve for V(s) and π(s) of the present state; a failure is counted."""
+        self.counts.failures += not self._loop.solve(prepare=prepare)
 
     def restart(self) -> None:
         """Reset the controller but for its linearisation point.
@@ -265,8 +244,9 @@ class TrainingLoop:
         Done at each checkpoint and on resuming, so that both runs have the same digits.
         """
         self.controller.reset()
-        if self._point is None:
-            self._solution = self._solve(self.s, prepare=True)
+        # A failed sample has left no linearisation point.
+        if self._loop.point is None:
+            self._solve()
         else:
             self.renew()
 
@@ -274,14 +254,14 @@ class TrainingLoop:
         """Arrays and numbers of loop and rule, θ included, without the plant's."""
         state: State = {
             "theta": self.controller.theta,
-            "s": self.s,
-            "applied": self._applied,
+            "s": self._loop.s,
+            "applied": self._loop.applied,
             "rng": generator_state(self.rng),
         }
         if self._algorithm_rng is not None:
             state["algorithm_rng"] = generator_state(self._algorithm_rng)
-        if self._point is not None:
-            state |= prefixed("point", self._point._asdict())
+        if self._loop.point is not None:
+            state |= prefixed("point", self._loop.point._asdict())
         state |= prefixed("counts", asdict(self.counts))
         state |= prefixed("algorithm", self.algorithm.state_dict())
         return state
@@ -289,11 +269,10 @@ class TrainingLoop:
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned; the plant must have been restored before."""
         self.controller.theta = state["theta"]
-        self.s = state["s"]
-        self._applied = state["applied"]
-        # A failed sample has left no linearisation point.
+        self._loop.s = state["s"]
+        self._loop.applied = state["applied"]
         point = part_of(state, "point")
-        self._point = LinearisationPoint(**point) if point else None
+        self._loop.point = LinearisationPoint(**point) if point else None
         self.counts = Counts(**part_of(state, "counts"))
         self.algorithm.load_state_dict(part_of(state, "algorithm"))
         # Only now: a rule may draw while it restores itself.

@@ -1,43 +1,60 @@
-/* The RTI-NMPC in closed loop with an empirical model: `learning.empirical_model.Rollout`, compiled.
+/* The RTI-NMPC in closed loop with an empirical model: `learning.rollout.Rollout`, compiled.
  *
  * `sizes.h` has K (states and cost) and the work space of `nominal`, CasADi's code for y(s, a; c) and
- * h(s, a). The controller is the package's own C (`core.h`).
+ * h(s, a). Controller and loop are the package's own C (`loop.h`).
  */
-#include "core.h"
+#define _POSIX_C_SOURCE 199309L
+#include "loop.h"
 
 #include "sizes.h"
 
-#define N_IN (N_X + N_U)
-
 int nominal(const double **arguments, double **results, long long int *iw, double *w, int memory);
 
-/* From a state `start`, `steps` samples, of which each meets the residual that `picks` names. `c` and
- * `W`, a row (1, s, a) an output, are the model's coefficients. Results, a row a sample: `inputs`
- * (s, a), `predicted` y(s, a; c) + W (1, s, a), and h. The samples before one whose state is not finite
- * are returned as their number, else `steps`. */
-int rollout(const double theta[], const double start[], const double c[], const double W[],
-            const double residuals[], const int32_t picks[], int steps, double *inputs,
-            double *predicted, double *h) {
-    CoreState state;
-    core_reset(&state);
-    memcpy(inputs, start, N_X * sizeof *start);
-    for (int step = 0; step < steps; step++, inputs += N_IN, predicted += K, h += K) {
-        double w[NOMINAL_W + 1];
-        if (!all_finite(inputs, N_X)) return step;
-        core_act(&state, inputs, 0, theta);
-        core_commit(&state);
-        memcpy(inputs + N_X, state.applied, sizeof state.applied);
-        const double *arguments[NOMINAL_ARG] = {inputs, inputs + N_X, c};
-        double *results[NOMINAL_RES] = {predicted, h};
-        long long int iw[NOMINAL_IW + 1];
-        if (nominal(arguments, results, iw, w, 0)) predicted[0] = NAN;
-        for (int i = 0; i < K; i++) {
-            predicted[i] += W[i * (N_IN + 1)];
-            for (int j = 0; j < N_IN; j++) predicted[i] += W[i * (N_IN + 1) + 1 + j] * inputs[j];
-        }
-        if (step + 1 < steps)
-            for (int i = 0; i < N_X; i++)
-                inputs[N_IN + i] = predicted[i] + h[i] * residuals[(int64_t)picks[step] * K + i];
+/* An empirical model: `c` and `W`, a row (1, s, a) an output, are its coefficients. Sample k meets the
+ * residual picks[k]. `output` is y(s, a; c) + W (1, s, a), and h. */
+typedef struct {
+    double inputs[N_W], output[2 * K];
+    const double *c, *W, *residuals;
+    const int32_t *picks;
+} Empirical;
+
+static int empirical_step(void *plant, long long sample, int *status) {
+    Empirical *const model = plant;
+    double *const predicted = model->output, *const h = model->output + K;
+    (void)status;
+    if (!all_finite(model->inputs, N_X)) return NOT_FINITE;
+    const double *arguments[NOMINAL_ARG] = {model->inputs, model->inputs + N_X, model->c};
+    double *results[NOMINAL_RES] = {predicted, h};
+    double w[NOMINAL_W + 1];
+    long long int iw[NOMINAL_IW + 1];
+    if (nominal(arguments, results, iw, w, 0)) predicted[0] = NAN;
+    for (int i = 0; i < K; i++) {
+        const double *const row = model->W + i * (N_W + 1);
+        predicted[i] += row[0];
+        for (int j = 0; j < N_W; j++) predicted[i] += row[1 + j] * model->inputs[j];
     }
-    return steps;
+    const double *const residual = model->residuals + (int64_t)model->picks[sample] * K;
+    for (int i = 0; i < N_X; i++) model->inputs[i] = predicted[i] + h[i] * residual[i];
+    return OK;
+}
+
+size_t rollout_columns(void) { return N_W + 2 * K + LOOP_COLUMNS; }
+
+/* `steps` samples from the state `start`, a row of `table` each (`loop_run`). Returns the number of the
+ * samples before one whose state is not finite, else `steps`. */
+int rollout(const double theta[], const double start[], const double c[], const double W[],
+            const double residuals[], const int32_t picks[], int steps, double *table) {
+    QP_SCRATCH RtiPrepared prepared;
+    QP_SCRATCH RtiSolved solved;
+    QP_SCRATCH RtiWork work;
+    Empirical model = {.c = c, .W = W, .residuals = residuals, .picks = picks};
+    const LoopPlant plant = {
+        empirical_step, &model, model.inputs + N_X, model.inputs, model.output, 2 * K,
+    };
+    Loop loop;
+    int fault[2];
+    memcpy(model.inputs, start, N_X * sizeof *start);
+    memcpy(prepared.theta, theta, sizeof prepared.theta);
+    loop_begin(&loop, &prepared, &solved, &work);
+    return (int)loop_run(&loop, &plant, 0, steps, table, fault);
 }

@@ -6,18 +6,19 @@ import ctypes
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.export.core import core
+from controllers.export.core import SOURCES, core
 from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.core.protocols import Array
-from cosim.core.simulation import recover
+from cosim.core.loop import ClosedLoop
+from cosim.core.protocols import Array, Step
 from learning.empirical_model import EmpiricalModel, Features, c_definitions, pointers
 
 
@@ -62,11 +63,14 @@ class Rollout:
             "sizes.h": c_definitions(sizes),
             # Where a function says that it is exported, Windows exports no other.
             "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
+            "loop.h": (SOURCES / "loop.h").read_bytes(),
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
         path = library(sources)
         if path is not None:
-            self.compiled = ctypes.CDLL(str(path)).rollout
+            compiled = ctypes.CDLL(str(path))
+            self.compiled = compiled.rollout
+            self._n_columns = int(compiled.rollout_columns())
 
     def __call__(
         self,
@@ -106,18 +110,20 @@ class Rollout:
         picks: NDArray[np.int32],
     ) -> RolloutSamples:
         """One rollout in C (`rollout.c`)."""
-        steps = len(picks)
-        inputs = np.empty((steps, self._features.n_inputs))
-        predicted = np.empty((steps, self._features.n_outputs))
-        h = np.empty((steps, self._features.n_outputs))
+        features = self._features
+        n_samples = len(picks)
         c, W = model.coefficients
         # C reads rows, one after the other.
         arguments = []
         for array in (theta, start, c, W, model.residuals, picks):
             arguments.append(np.ascontiguousarray(array))
         assert self.compiled is not None
-        done = self.compiled(*pointers(*arguments), steps, *pointers(inputs, predicted, h))
-        return RolloutSamples(inputs[:done], predicted[:done], h[:done])
+        # A row is the one of every closed loop: state and action, the plant's outputs, and more.
+        ends = np.cumsum([features.n_inputs, features.n_outputs, features.n_outputs])
+        table = np.empty((n_samples, self._n_columns))
+        done = self.compiled(*pointers(*arguments), n_samples, *pointers(table))
+        inputs, predicted, h, _ = np.split(table[:done], ends, axis=1)
+        return RolloutSamples(inputs.copy(), predicted.copy(), h.copy())
 
     def _interpreted(
         self,
@@ -127,32 +133,61 @@ class Rollout:
         picks: NDArray[np.int32],
     ) -> RolloutSamples:
         """The same in Python."""
-        problem = self._problem
-        controller = self._controller
-        steps = len(picks)
-        inputs = np.empty((steps, self._features.n_inputs))
-        predicted = np.empty((steps, self._features.n_outputs))
-        h = np.empty((steps, self._features.n_outputs))
-        c, W = model.coefficients
-        controller.theta = theta
-        controller.reset()
-        s = start
-        a = problem.reference_action
+        plant = ModelledPlant(model, start, picks)
+        self._controller.theta = theta
+        loop = ClosedLoop(plant.step, self._controller, self._problem)
+        loop.start(start)
+        n_samples = 0
         with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
-            for step, pick in enumerate(picks):
-                if not np.isfinite(s).all():
-                    return RolloutSamples(inputs[:step], predicted[:step], h[:step])
-                try:
-                    controller.prepare()
-                    wanted = controller.feedback(s).action
-                    a = np.clip(wanted, problem.action_lower, problem.action_upper)
-                except Exception as error:
-                    recover(controller, error)
-                # As in C: the prediction first, the residual makes the next state.
-                inputs[step] = np.concatenate([s, a])
-                y, size = self._features.mean(s, a, c)
-                predicted[step] = y.full()[:, 0] + W @ np.append(1.0, inputs[step])
-                h[step] = size.full()[:, 0]
-                outcome = predicted[step] + h[step] * model.residuals[pick]
-                s = outcome[:-1]
-        return RolloutSamples(inputs, predicted, h)
+            while n_samples < len(picks) and np.isfinite(loop.s).all():
+                loop.advance()
+                n_samples += 1
+        return RolloutSamples(
+            plant.inputs[:n_samples], plant.predicted[:n_samples], plant.h[:n_samples]
+        )
+
+
+class ModelledPlant:
+    """An empirical model as a plant, with a table of its samples.
+
+    Args:
+        model: plays the plant.
+        start: state, (n,).
+        picks: which of the model's residuals each sample meets, (T,).
+
+    Attributes:
+        inputs, predicted, h: rows of `RolloutSamples`, (T, …), filled so far as it has stepped.
+    """
+
+    def __init__(
+        self,
+        model: EmpiricalModel,
+        start: Array,
+        picks: NDArray[np.int32],
+    ) -> None:
+        features = model.features
+        n_samples = len(picks)
+        self._model = model
+        self._c, self._W = model.coefficients
+        self._picks = picks
+        self._s = start
+        self._number = 0
+        self.inputs = np.empty((n_samples, features.n_inputs))
+        self.predicted = np.empty((n_samples, features.n_outputs))
+        self.h = np.empty((n_samples, features.n_outputs))
+
+    def step(self, a: Array) -> Step:
+        """Hold the action a (m,) for one sampling time."""
+        number = self._number
+        # As in C: the prediction first, the residual makes the next state.
+        inputs = np.concatenate([self._s, a])
+        y, h = self._model.features.mean(self._s, a, self._c)
+        self.inputs[number] = inputs
+        self.predicted[number] = y.full()[:, 0] + self._W @ np.append(1.0, inputs)
+        self.h[number] = h.full()[:, 0]
+        residual = self._model.residuals[self._picks[number]]
+        outcome = self.predicted[number] + self.h[number] * residual
+        self._s = outcome[:-1]
+        self._number = number + 1
+        # The penalty is a matter of whoever reads the table.
+        return Step(self._s, float(outcome[-1]), nan, residual)

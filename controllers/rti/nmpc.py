@@ -449,7 +449,7 @@ class Engine:
             long = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
             stagewise = long or stack_needed(functions) > STACK_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
-        for name in ("sensitivities.h", "engine.c"):
+        for name in ("sensitivities.h", "loop.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)
         return None if path is None else cls(str(path), functions, stagewise)

@@ -85,14 +85,10 @@ def check(
     """
     with output(json) as out_:
         from cosim.core.errors import FmuWarning, PlantError
-        from cosim.core.processes import watch
         from cosim.plant.check import PlantCheck, check_plant
-        from cosim.plant.fmi import SHIPPED
 
         path = Path(file).absolute()
         try:
-            if file not in SHIPPED:
-                watch(f"FMU '{path}', or other native code,")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", FmuWarning)  # the table says the same
                 found = check_plant(
@@ -145,7 +141,7 @@ def build(
     with output(json) as out_:
         from fmus import BuildError
         from fmus.build import build_folder
-        from fmus.evaporator import build as build_fmus
+        from fmus.evaporator import build_evaporator as build_fmus
         from fmus.evaporator import build_in_place, compare_with_shipped
 
         every = platforms == "all"

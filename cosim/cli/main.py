@@ -31,7 +31,7 @@ from cosim.cli import (
 )
 from cosim.core.errors import CosimError, CosimWarning
 from cosim.core.files import protect
-from cosim.core.processes import Finished, Interrupted, Terminated, command_process, unwound
+from cosim.core.processes import Interrupted, Terminated, command_process, unwound
 
 OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
 """Options whose value is an output path."""
@@ -91,7 +91,7 @@ class _Commands(TyperGroup):
             raise CosimError("a pipe that the command, or a plug-in, writes to is closed") from None
         except SystemExit as error:
             if isinstance(error.__context__, BrokenPipeError):  # the reader of our own output left
-                raise Finished(EXIT_CLOSED_PIPE) from None
+                raise SystemExit(EXIT_CLOSED_PIPE) from None
             raise CosimError(f"a plug-in ended the command by exit({error.code})") from error
 
 
@@ -218,8 +218,8 @@ def _open_streams() -> None:
 def _run() -> None:
     try:
         app()
-    except (SystemExit, Finished) as error:
-        sys.exit(error.args[0] if error.args else 0)
+    except SystemExit:
+        raise
     except (Interrupted, Terminated) as error:
         unwound.set()
         stopped = isinstance(error, Interrupted)

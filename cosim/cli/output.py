@@ -16,7 +16,7 @@ import typer
 
 from cosim.core.errors import CosimError
 from cosim.core.files import write_atomically
-from cosim.core.processes import Terminated, hold, redirected_output, release, watch
+from cosim.core.processes import Terminated, hold, redirected_output, release
 
 MOST = 100_000_000
 """Samples of the longest run."""
@@ -104,12 +104,10 @@ class Output:
             sys.stdout.write(dump(document))
 
     def announce(self, fmu: str) -> None:
-        """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""
+        """Say which FMU's native code is about to run, unless it is a shipped one."""
         from cosim.plant.fmi import SHIPPED, unpack
 
         if fmu not in SHIPPED:
-            # The child that is watched unpacks it, so that a warning about it comes once.
-            watch(f"FMU '{Path(fmu).absolute()}', or other native code,")
             found = unpack(fmu)
             self.note(f"native code of {found.path}, sha256 {found.sha256}")
 

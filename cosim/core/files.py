@@ -43,7 +43,6 @@ __all__ = [
 
 STAGED = ".cosim-staged-"
 """Begin of the names of folders in which the files of a run wait for its end."""
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 @contextmanager
@@ -65,19 +64,26 @@ def staged(folder: str | Path, owned: Iterable[str] = ()) -> Iterator[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with temporary_folder(STAGED, folder) as work:
-        new, old = work / "new", work / "old"
+        new = work / "new"
+        old = work / "old"
         new.mkdir()
         old.mkdir()
         try:
             yield new
             _exchange(new, old, folder, owned)
         except OSError as error:
-            if isinstance(error.filename, str):  # as the user knows it
+            # As the user knows it.
+            if isinstance(error.filename, str):
                 error.filename = error.filename.replace(str(new), str(folder))
             raise
 
 
-def _exchange(new: Path, old: Path, folder: Path, owned: Iterable[str]) -> None:
+def _exchange(
+    new: Path,
+    old: Path,
+    folder: Path,
+    owned: Iterable[str],
+) -> None:
     """Move files of `new` to a folder, and the owned ones that it lacks to `old`; all or none."""
     names = [path.relative_to(new) for path in sorted(new.rglob("*")) if path.is_file()]
     earlier = {path.relative_to(folder) for pattern in owned for path in folder.glob(pattern)}
@@ -112,13 +118,18 @@ def _exchange(new: Path, old: Path, folder: Path, owned: Iterable[str]) -> None:
 @contextmanager
 def without_signals() -> Iterator[None]:
     """Hold back Ctrl-C, SIGTERM and SIGHUP until the end of the block."""
+    # Only the main thread handles signals.
     if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread handles signals
+        yield
         return
-    numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
-    numbers = [n for n in numbers if signal.getsignal(n) not in (None, signal.SIG_IGN)]
     caught: list[int] = []
-    before = {n: signal.signal(n, lambda number, _: caught.append(number)) for n in numbers}
+    before = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        # Windows has no SIGHUP; what the caller ignores, as nohup does, stays ignored.
+        if number is None or signal.getsignal(number) in (None, signal.SIG_IGN):
+            continue
+        before[number] = signal.signal(number, lambda received, _: caught.append(received))
     try:
         yield
     finally:
@@ -129,10 +140,15 @@ def without_signals() -> Iterator[None]:
 
 
 def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:
-    """Take a lock file within `timeout` seconds; a context whose end gives it back.
+    """Take a lock file; a context whose end gives it back.
 
-    Raises filelock.Timeout where another process holds it; OSError where it cannot be written, or
-    its file system gives no locks.
+    Args:
+        path: the file.
+        timeout: seconds to wait for it.
+
+    Raises:
+        filelock.Timeout: another process holds it.
+        OSError: it cannot be written, or its file system gives no locks.
     """
     import filelock  # noqa: PLC0415
 
@@ -140,14 +156,17 @@ def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:
         # Whoever may write the folder may write its lock, so that no lock outlives its process.
         return filelock.FileLock(path, timeout, 0o666, fallback_to_soft=False).acquire()
     except OSError as error:
-        if not error.filename and error.strerror:  # not from opening it, and no Timeout
+        # Not from opening it, and no Timeout.
+        if not error.filename and error.strerror:
             what = f"its file system gives no locks ({error.strerror}): choose another folder"
             error = OSError(error.errno, f"{what}, by {CACHE_VARIABLE} for the cache", str(path))
         raise error from None
 
 
 CACHE_VARIABLE = "COSIM_CACHE"
+"""Variable of the environment that names the folder of caches."""
 _temporary: dict[Path, Path] = {}
+"""Temporary folders in place of caches that cannot be used."""
 
 
 def cache_folder(kind: str, *, plain: bool = False) -> Path:
@@ -157,14 +176,18 @@ def cache_folder(kind: str, *, plain: bool = False) -> Path:
     A temporary one, until this process ends, where that cannot be written or others could write it,
     since native code is loaded from here.
 
-    `plain` asks for a path without blanks and other signs that a URI escapes: where the user's has
-    some, a folder of the user alone in the system's folder of temporary files takes its place.
+    Args:
+        kind: name of the folder.
+        plain: asks for a path without blanks and other signs that a URI escapes. Where the user's
+            has some, a folder of the user alone in the system's folder of temporary files takes its
+            place.
     """
     chosen = os.environ.get(CACHE_VARIABLE)
     root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
-    user = getattr(os, "getuid", int)()  # Windows has a folder of temporary files for each user
     folder = root.absolute() / kind
     if plain and not _is_plain(folder):
+        # Windows has a folder of temporary files for each user.
+        user = getattr(os, "getuid", int)()
         folder = Path(tempfile.gettempdir()) / f"rti-cosim-{user}" / kind
     if _is_ours_alone(folder):
         return folder
@@ -185,23 +208,32 @@ def _is_ours_alone(folder: Path) -> bool:
         folder.parent.parent.mkdir(parents=True, exist_ok=True)
         for level in levels:
             level.mkdir(mode=0o700, exist_ok=True)
-        found = [level.lstat() for level in levels]
+        statuses = [level.lstat() for level in levels]
     except OSError:
         return False
-    return os.name == "nt" or all(  # Windows closes a user's profile by other means
-        status.st_uid == os.geteuid()
-        and status.st_mode & (stat.S_IRWXU | stat.S_IWGRP | stat.S_IWOTH) == stat.S_IRWXU
-        and stat.S_ISDIR(status.st_mode)
-        for status in found
-    )
+    # Windows closes a user's profile by other means.
+    if os.name == "nt":
+        return True
+    for status in statuses:
+        # The user may do all, no other may write.
+        permissions = status.st_mode & (stat.S_IRWXU | stat.S_IWGRP | stat.S_IWOTH)
+        if status.st_uid != os.geteuid() or permissions != stat.S_IRWXU:
+            return False
+        if not stat.S_ISDIR(status.st_mode):
+            return False
+    return True
 
 
 @contextmanager
 def temporary_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
     """A new folder that only this user can enter, deleted at the end of the block.
 
-    `parent` is where it lies, by default where the system keeps temporary files. Raises OSError
-    where it cannot be made.
+    Args:
+        prefix: begin of its name.
+        parent: where it lies, by default where the system keeps temporary files.
+
+    Raises:
+        OSError: it cannot be made.
     """
     with tempfile.TemporaryDirectory(
         prefix=prefix, dir=parent, ignore_cleanup_errors=True
@@ -226,29 +258,78 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
-def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a TOML file; `origin` is its name in messages.
+def read_toml(
+    path: str | Path,
+    origin: str,
+    error: type[Exception],
+) -> dict[str, Any]:
+    """Document of a TOML file.
 
-    Raises `error` where there is no such regular file, or where it is not UTF-8 or not TOML.
+    Args:
+        path: of the file.
+        origin: what messages call it.
+        error: class of the exception that is raised.
+
+    Raises:
+        error: there is no such regular file, or it is not UTF-8 or not TOML.
     """
     return parse_toml(read_text(path, origin, error), origin, error)
 
 
-def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a JSON file, an object; raises `error` as `read_toml` does."""
+def read_json(
+    path: str | Path,
+    origin: str,
+    error: type[Exception],
+) -> dict[str, Any]:
+    """Document of a JSON file, an object.
+
+    Args:
+        path: of the file.
+        origin: what messages call it.
+        error: class of the exception that is raised.
+
+    Raises:
+        error: as `read_toml`.
+    """
     document = _parsed(json.loads, "JSON", read_text(path, origin, error), origin, error)
     if not isinstance(document, dict):
         raise error(f"{origin} is not a JSON object")
     return document
 
 
-def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a TOML text; `origin` is its name in messages. Raises `error` on other text."""
+def parse_toml(
+    text: str,
+    origin: str,
+    error: type[Exception],
+) -> dict[str, Any]:
+    """Document of a TOML text.
+
+    Args:
+        text: TOML.
+        origin: what messages call it.
+        error: class of the exception that is raised.
+
+    Raises:
+        error: on other text.
+    """
     return dict(_parsed(tomllib.loads, "TOML", text, origin, error))
 
 
-def read_text(path: str | Path, origin: str, error: type[Exception]) -> str:
-    """Text of a UTF-8 file; raises `error` where there is no such regular file, or other bytes."""
+def read_text(
+    path: str | Path,
+    origin: str,
+    error: type[Exception],
+) -> str:
+    """Text of a UTF-8 file.
+
+    Args:
+        path: of the file.
+        origin: what messages call it.
+        error: class of the exception that is raised.
+
+    Raises:
+        error: there is no such regular file, or it holds other bytes.
+    """
     try:
         if Path(path).exists() and not Path(path).is_file():
             raise error(f"{origin} is not a regular file")
@@ -263,7 +344,11 @@ def read_text(path: str | Path, origin: str, error: type[Exception]) -> str:
 
 
 def _parsed(
-    parse: Callable[[str], Any], kind: str, text: str, origin: str, error: type[Exception]
+    parse: Callable[[str], Any],
+    kind: str,
+    text: str,
+    origin: str,
+    error: type[Exception],
 ) -> Any:
     try:
         return parse(text)

@@ -17,8 +17,6 @@ from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
 
-from cosim.core.processes import watch
-
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 """Form of an object's name, `module:Name`."""
 OURS = ("fmus", "cosim", "controllers", "learning")
@@ -35,7 +33,7 @@ UNKNOWN = "cannot be known"
 _folders: list[str] = []
 _loaded: dict[Path, str] = {}
 """Hash of the sources at each place from which a user's module was loaded, as of that time."""
-_lock = threading.RLock()
+_import_lock = threading.RLock()
 
 
 def import_from(folder: str | Path) -> None:
@@ -44,8 +42,9 @@ def import_from(folder: str | Path) -> None:
     Args:
         folder: the folder, relative to the working directory as it is now.
     """
-    if (text := str(Path(folder).absolute())) not in _folders:
-        _folders.append(text)
+    path = str(Path(folder).absolute())
+    if path not in _folders:
+        _folders.append(path)
 
 
 def import_folders() -> tuple[str, ...]:
@@ -61,14 +60,16 @@ def importing() -> Iterator[None]:
     No bytecode is written meanwhile: Python takes it for current where the source has the same
     size and was changed in the same second, and would run the code from before an edit.
     """
-    with _lock:
+    with _import_lock:
         written = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         added = [folder for folder in import_folders() if folder not in sys.path]
-        for package in OURS:  # a folder of such a name would be found before an editable install
-            names = [Path(folder) / f"{package}{end}" for folder in added for end in ("", ".py")]
-            if any(name.exists() for name in names):
-                importlib.import_module(package)
+        # A folder of such a name would be found before an editable install.
+        for package in OURS:
+            for folder in added:
+                path = Path(folder, package)
+                if path.exists() or path.with_suffix(".py").exists():
+                    importlib.import_module(package)
         sys.path.extend(added)
         importlib.invalidate_caches()
         try:
@@ -80,7 +81,11 @@ def importing() -> Iterator[None]:
                     sys.path.remove(folder)
 
 
-def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
+def load_plugin(
+    target: str,
+    what: str,
+    error: type[Exception],
+) -> Any:
     """Import an object by its name; a module that was edited since it was loaded is loaded anew.
 
     Args:
@@ -99,38 +104,33 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
         raise error(f"{what} must be given as module:Name, not '{target}'")
     module, _, attribute = target.partition(":")
     foreign = module.partition(".")[0] not in OURS
-    if foreign:
-        watch(f"plug-in '{target}'")
     try:
         with importing():
             if foreign:
                 _forget_edited_modules()
-            found: Any = importlib.import_module(module)
-            if foreign and (place := _place(module)) is not None:
+            plugin: Any = importlib.import_module(module)
+            place = _place(module) if foreign else None
+            if place is not None:
                 _loaded.setdefault(place, _sources_hash(place))
         for part in attribute.split("."):
-            found = getattr(found, part)
+            plugin = getattr(plugin, part)
     # A module may raise anything while it is imported, and one that is a script may even exit.
     except (Exception, SystemExit) as cause:
         raise error(f"{what} cannot be imported: {exception_line(cause)}") from cause
-    if foreign and (others := _others_of_that_name(module)):
-        raise error(
-            f"{what}: two files have the name of its module, '{others[0]}' and '{others[1]}'; "
-            "rename one of them, or use each in a process of its own"
-        )
-    return found
+    if foreign:
+        _refuse_two_of_one_name(module, what, error)
+    return plugin
 
 
 def exception_line(cause: BaseException) -> str:
     """The exception, its file and its line, as one line of text."""
-    said = str(cause) if isinstance(cause, ImportError) else f"{type(cause).__name__}: {cause}"
-    frames = [
-        frame
-        for frame in traceback.extract_tb(cause.__traceback__)
-        if not frame.filename.startswith("<frozen") and Path(frame.filename) != Path(__file__)
-    ]
-    where = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    return f"{' '.join(said.split())}{where}"
+    words = str(cause) if isinstance(cause, ImportError) else f"{type(cause).__name__}: {cause}"
+    line = " ".join(words.split())
+    # The last frame that is neither Python's import nor this file.
+    for frame in reversed(traceback.extract_tb(cause.__traceback__)):
+        if not frame.filename.startswith("<frozen") and Path(frame.filename) != Path(__file__):
+            return f"{line} ({frame.filename}, line {frame.lineno})"
+    return line
 
 
 def code_of(module: str) -> str | None:
@@ -156,8 +156,11 @@ def code_of(module: str) -> str | None:
     if not installed and any(place.is_relative_to(folder) for folder in PYTHON):
         return None
     code = _loaded.setdefault(place, _sources_hash(place))
-    names = _distributions().get(top, []) if installed else []
-    return " ".join([*(f"{name} {version(name)}" for name in names), code])
+    words = []
+    if installed:
+        for name in _distributions().get(top, []):
+            words.append(f"{name} {version(name)}")
+    return " ".join([*words, code])
 
 
 @cache
@@ -175,11 +178,13 @@ def _place(module: str) -> Path | None:
     if module == "__main__" or not isinstance(file, str) or not Path(file).is_file():
         return None
     path = Path(file).absolute()
-    inner = module.count(".") + (path.stem == "__init__")
-    folder = path.parents[inner]
+    # How many folders of packages the file is in.
+    depth = module.count(".") + (path.stem == "__init__")
+    folder = path.parents[depth]
     if folder.name not in INSTALLED:
         return folder
-    return path if not inner else path.parents[inner - 1]
+    # Of an installed one the package alone: its folder holds all that is installed.
+    return path.parents[depth - 1] if depth else path
 
 
 def _forget_edited_modules() -> None:
@@ -202,16 +207,25 @@ def _forget(place: Path) -> None:
             del sys.modules[name]
 
 
-def _others_of_that_name(module: str) -> list[Path]:
-    """Places of a loaded module and of another one of that name in `import_folders`, or []."""
-    place, top = _place(module), module.partition(".")[0]
+def _refuse_two_of_one_name(
+    module: str,
+    what: str,
+    error: type[Exception],
+) -> None:
+    """Raise `error` where another file in `import_folders` has a loaded module's name."""
+    place = _place(module)
     if place is None:
-        return []
+        return
+    top = module.partition(".")[0]
     for folder in map(Path, import_folders()):
-        there = (folder / f"{top}.py").is_file() or (folder / top / "__init__.py").is_file()
-        if there and not folder.samefile(place) and _sources_hash(folder) != _sources_hash(place):
-            return [place / top, folder / top]
-    return []
+        is_there = (folder / f"{top}.py").is_file() or (folder / top / "__init__.py").is_file()
+        # A copy of the same sources does no harm.
+        if not is_there or folder.samefile(place) or _sources_hash(folder) == _sources_hash(place):
+            continue
+        raise error(
+            f"{what}: two files have the name of its module, '{place / top}' and '{folder / top}'; "
+            "rename one of them, or use each in a process of its own"
+        )
 
 
 def _sources_hash(place: Path) -> str:
@@ -228,21 +242,20 @@ def _sources_hash(place: Path) -> str:
 
 def _python_files(folder: Path, seen: set[Path]) -> Iterator[Path]:
     """Modules of a folder, compiled ones too, and those of the folders in it that hold any."""
-    if (real := folder.resolve()) in seen:
+    # Links may lead round in a circle.
+    real = folder.resolve()
+    if real in seen:
         return
     seen.add(real)
     with suppress(OSError):
         entries = sorted(folder.iterdir())
         modules = [path for path in entries if path.name.endswith((".py", *EXTENSION_SUFFIXES))]
+        # The first folder may hold packages alone.
         if not modules and len(seen) > 1:
             return
         yield from (path for path in modules if path.is_file())
         for path in entries:
-            ours = folder == ROOT and path.name in OURS
-            if (
-                path.is_dir()
-                and path.name.isidentifier()
-                and path.name != "__pycache__"
-                and not ours
-            ):
+            is_ours = folder == ROOT and path.name in OURS
+            is_package = path.name.isidentifier() and path.name != "__pycache__"
+            if path.is_dir() and is_package and not is_ours:
                 yield from _python_files(path, seen)

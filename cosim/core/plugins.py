@@ -16,8 +16,10 @@ from cosim.core.protocols import Controller
 from cosim.core.scenario import Scenario
 from cosim.core.validation import suggestion
 
-CONTROLLERS, ALGORITHMS = "cosim.controllers", "cosim.algorithms"
-"""Groups of entry points: factory(scenario), and algorithms."""
+CONTROLLERS = "cosim.controllers"
+"""Group of entry points factory(scenario)."""
+ALGORITHMS = "cosim.algorithms"
+"""Group of entry points of algorithms."""
 
 
 @cache
@@ -30,8 +32,11 @@ def registered(group: str) -> dict[str, str]:
 class ControllerSource:
     """A controller by its content, so that it is built alike whatever becomes of its file.
 
-    `name` is an entry point of the group `cosim.controllers`, a `module:factory`, or the path of a
-    file of θ, whose text is `theta`. `kind` is the NMPC that carries θ, `rti` or `converged`.
+    Attributes:
+        name: an entry point of the group `cosim.controllers`, a `module:factory`, or the path of a
+            θ file.
+        theta: text of the θ file.
+        kind: the NMPC that carries θ, `rti` or `converged`.
     """
 
     name: str
@@ -47,7 +52,8 @@ class ControllerSource:
 
     def build(self, scenario: Scenario) -> Controller:
         """Build the controller; raises ControllerLookupError and the controller's own errors."""
-        known, name = registered(CONTROLLERS), self.name
+        known = registered(CONTROLLERS)
+        name = self.name
         if self.theta is not None:
             # Import it by its name: `cosim` itself imports no controller here.
             read = load_plugin("controllers.factories:from_toml", "θ", ControllerLookupError)
@@ -82,7 +88,11 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     return ControllerSource.read(name).build(scenario)
 
 
-def _made(name: str, target: str, scenario: Scenario) -> Controller:
+def _made(
+    name: str,
+    target: str,
+    scenario: Scenario,
+) -> Controller:
     factory = load_plugin(target, f"controller '{name}'", ControllerLookupError)
     if not callable(factory):
         raise ControllerLookupError(f"controller '{name}' is not a factory of one scenario")
@@ -91,7 +101,8 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
             controller = factory(scenario)
     except (Exception, SystemExit) as error:
         packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
-        if target == name and not packages & set(OURS):  # the words of ours say enough
+        # The words of our own errors say enough.
+        if target == name and not packages & set(OURS):
             raise ControllerLookupError(
                 f"the factory of controller '{name}' failed: {exception_line(error)}"
             ) from error

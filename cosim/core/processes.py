@@ -1,4 +1,4 @@
-"""Processes and signals: who ends with whom, who writes where, and foreign code in a child."""
+"""Processes and signals: who ends with whom, and who writes where."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import IO, TYPE_CHECKING, Any, NoReturn
+from typing import IO, TYPE_CHECKING
 
-from cosim.core.errors import CosimError, PlantError
-from cosim.core.files import STAGED, lock, temporary_folder, write_atomically
+from cosim.core.errors import CosimError
+from cosim.core.files import STAGED, lock, write_atomically
 
 # psutil and filelock are imported where they are needed: every command imports this file.
 if TYPE_CHECKING:
@@ -36,8 +36,6 @@ class Interrupted(BaseException):
 unwound = threading.Event()
 """Set while no command runs in this process, and once one has unwound: signals are then ignored."""
 unwound.set()
-_watched = False
-"""Whether another process has started this one, and watches it."""
 _SIGNALS = [
     getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)
 ]
@@ -45,15 +43,18 @@ _SIGNALS = [
 
 @contextmanager
 def command_process() -> Iterator[None]:
-    """Run a command: foreign code in it is watched, and signals unwind it.
+    """Run a command so that signals unwind it.
 
     Ctrl-C raises KeyboardInterrupt, SIGTERM and SIGHUP `Terminated`, once. Signals that the caller
     ignores, as nohup and a shell's background jobs do, stay ignored. Restores the previous
     handlers; at interpreter shutdown the signals are ignored.
     """
     unwound.clear()
-    own = (signal.SIG_DFL, signal.default_int_handler)
-    before = {n: signal.signal(n, _raise) for n in _SIGNALS if signal.getsignal(n) in own}
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    before = {}
+    for number in _SIGNALS:
+        if signal.getsignal(number) in defaults:
+            before[number] = signal.signal(number, _raise)
     try:
         yield
     finally:
@@ -65,15 +66,21 @@ def command_process() -> Iterator[None]:
 
 def _raise(number: int, _: FrameType | None) -> None:
     """Raise the signal's exception, and again after a second in case C code has cleared it."""
-    found = sys.exception()
-    while found is not None and not isinstance(found, KeyboardInterrupt | Terminated):
-        found = found.__context__
-    if unwound.is_set() or found is not None:
+    # While one of them unwinds the command, a second signal is ignored.
+    unwinding = sys.exception()
+    while unwinding is not None and not isinstance(unwinding, KeyboardInterrupt | Terminated):
+        unwinding = unwinding.__context__
+    if unwound.is_set() or unwinding is not None:
         return
 
     def again() -> None:
-        if not unwound.is_set():
-            signal.raise_signal(number) if os.name == "nt" else os.kill(os.getpid(), number)
+        if unwound.is_set():
+            return
+        # In a thread: only the process as a whole reaches the main thread.
+        if os.name == "nt":
+            signal.raise_signal(number)
+        else:
+            os.kill(os.getpid(), number)
 
     timer = threading.Timer(1.0, again)
     timer.daemon = True
@@ -92,7 +99,8 @@ def without_interrupts() -> Iterator[None]:
         return
     from multiprocessing.resource_tracker import ensure_running  # noqa: PLC0415
 
-    ensure_running()  # started later, it would unblock Ctrl-C
+    # Started later, it would unblock Ctrl-C.
+    ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -134,9 +142,16 @@ def child_process(
     """Start a command; end it, and all that it has started, at the end of the block.
 
     It belongs to this process's group, so that a closed terminal, say, ends both; on Linux a kill
-    of this process alone ends it as well. `folder` is its working directory and holds its temporary
-    files; `env` is its environment; `log` takes its output. Raises OSError where it cannot be
-    started.
+    of this process alone ends it as well.
+
+    Args:
+        command: its words.
+        folder: its working directory, which holds its temporary files.
+        env: its environment.
+        log: takes its output.
+
+    Raises:
+        OSError: it cannot be started.
     """
     environment = dict(os.environ if env is None else env)
     if folder is not None:
@@ -173,7 +188,8 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 LOCK = ".cosim.lock"
 HOLDER = ".cosim.lock.holder"
-_held: dict[Path, filelock.BaseFileLock] = {}
+_locks: dict[Path, filelock.BaseFileLock] = {}
+"""Locks of this process, by folder."""
 
 
 def hold(folder: Path) -> None:
@@ -185,10 +201,10 @@ def hold(folder: Path) -> None:
     import filelock  # noqa: PLC0415
 
     folder = folder.resolve()
-    if folder in _held:
+    if folder in _locks:
         return
     try:
-        _held[folder] = lock(folder / LOCK, 0).lock
+        _locks[folder] = lock(folder / LOCK, 0).lock
     except filelock.Timeout:
         who = "another process"
         with suppress(OSError, ValueError):
@@ -196,8 +212,9 @@ def hold(folder: Path) -> None:
         raise CosimError(
             f"folder '{folder}' is being written by {who}; wait for it or choose another --out"
         ) from None
-    for left in folder.glob(f"{STAGED}*"):  # by a process that was killed
-        shutil.rmtree(left, ignore_errors=True)
+    # What a process that was killed has left.
+    for staged in folder.glob(f"{STAGED}*"):
+        shutil.rmtree(staged, ignore_errors=True)
     since = datetime.now(UTC).isoformat(timespec="seconds")
     command = " ".join(["cosim", *sys.argv[1:]])
     holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
@@ -208,7 +225,7 @@ def hold(folder: Path) -> None:
 def holding(folder: Path) -> Iterator[None]:
     """Hold a folder, made if need be, during the block, as `hold` does."""
     folder.mkdir(parents=True, exist_ok=True)
-    ours = folder.resolve() not in _held
+    ours = folder.resolve() not in _locks
     hold(folder)
     try:
         yield
@@ -219,104 +236,39 @@ def holding(folder: Path) -> Iterator[None]:
 
 def release() -> list[Path]:
     """Release every lock of this process and remove its files; returns the folders."""
-    folders = list(_held)
+    folders = list(_locks)
     for folder in folders:
         _release(folder)
     return folders
 
 
 def _release(folder: Path) -> None:
-    held = _held.pop(folder)
+    lock_ = _locks.pop(folder)
     # Remove it while it is held: another process then makes another file.
     for name in (HOLDER, LOCK):
         with suppress(OSError):
             (folder / name).unlink()
-    held.release()
-
-
-_stdout: list[int] = []
-"""Descriptor of standard output while it is turned aside."""
+    lock_.release()
 
 
 @contextmanager
 def redirected_output() -> Iterator[int | None]:
-    """Redirect standard output, of native code too, to standard error; yields the true descriptor.
+    """Redirect standard output, of native code too, to standard error.
 
-    It is None where standard output is not this process's own, as in a test runner.
+    Yields:
+        The descriptor of the true standard output; None where standard output is not this
+        process's own, as in a test runner.
     """
-    own = sys.stdout is sys.__stdout__
-    if not own:
+    is_ours = sys.stdout is sys.__stdout__
+    if not is_ours:
         yield None
         return
     sys.stdout.flush()
-    _stdout.append(os.dup(1))
+    descriptor = os.dup(1)
     os.dup2(2, 1)
     try:
-        yield _stdout[-1]
+        yield descriptor
     finally:
         sys.stdout.flush()
-        os.dup2(_stdout[-1], 1)
-        os.close(_stdout.pop())
-
-
-class Finished(BaseException):
-    """A watched command has ended; its argument is the exit code."""
-
-
-def run_watched(main: Callable[[], None], parent: int, mark: str) -> NoReturn:
-    """Run the command line for a watching process; create the file `mark` at its end.
-
-    It is missing where foreign code calls `exit(0)` or is killed. Threads that foreign code has
-    left do not keep the process.
-    """
-    global _watched  # noqa: PLW0603
-    _watched = True
-    follow_parent(parent)
-    code: Any = 0
-    try:
-        main()
-    except SystemExit as error:
-        code = error.code
-    try:
-        sys.stdout.flush()
-    except (OSError, ValueError, AttributeError):  # closed, or taken away by foreign code
-        code = code or 1
-    Path(mark).touch()
-    os._exit(code or 0)
-
-
-def watch(suspect: str) -> None:
-    """Run this command again in a child process, and exit as that does.
-
-    To be called before foreign code, `suspect` in messages, is loaded. Returns in that child, and
-    where no command line was called. Raises PlantError where the child ended before the command.
-    """
-    if unwound.is_set() or _watched:
-        return
-    flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
-    folders = release()  # for the process that does the work
-    with temporary_folder("cosim-") as temporary:
-        mark = temporary / "finished"
-        # Pass on the import path: a folder of the user's may have the name of a package.
-        program = (
-            f"import sys; sys.path[:] = {sys.path}; from cosim import cli; "
-            "from cosim.core import processes; "
-            f"processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"
-        )
-        words = [sys.executable, *flags, "-c", program, *sys.argv[1:]]
-        child = subprocess.Popen(words, stdout=(*_stdout, None)[0])
-        try:
-            code = child.wait()
-        except BaseException as error:
-            if not isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the child, too
-                child.terminate()
-            child.wait()
-            raise
-        finished = mark.exists()
-    if finished and code >= 0:
-        raise Finished(code)
-    for folder in folders:  # so that the locks of a process that was killed are cleared away
-        with suppress(CosimError, OSError):
-            hold(folder)
-    how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-    raise PlantError(f"{suspect} ended the process {how} before the command finished")
+        os.dup2(descriptor, 1)
+        os.close(descriptor)

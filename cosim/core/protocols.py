@@ -49,6 +49,22 @@ class Plant(Protocol):
         """Hold the action a (m,) for one sampling time."""
 
 
+class ActionLimits(Protocol):
+    """What a closed loop knows of the actuators; a scenario has it, and a controller's problem."""
+
+    @property
+    def action_lower(self) -> Array:
+        """Lower bounds of the actions, (m,)."""
+
+    @property
+    def action_upper(self) -> Array:
+        """Upper bounds of the actions, (m,)."""
+
+    @property
+    def reference_action(self) -> Array:
+        """The action of the reference steady state, (m,)."""
+
+
 class Solution(Protocol):
     """The result of a controller's `feedback`."""
 
@@ -104,7 +120,12 @@ class Controller(Protocol):
         """Do the work that needs no measurement, e.g. shift and linearise."""
 
     def feedback(self, s: Array, a: Array | None = None) -> Solution:
-        """Solve for the measured state s (n,), with the first action fixed to a (m,) if given."""
+        """Solve for the measured state.
+
+        Args:
+            s: state, (n,).
+            a: to which the first action is fixed, (m,); without it the controller chooses.
+        """
 
 
 CompiledLoop = Callable[[Any, int, Array], tuple[int, int, int]]
@@ -128,14 +149,30 @@ class Recorder(Protocol):
         steps: int,
         units: dict[str, str],
     ) -> None:
-        """Open the record; `units` maps each FMU variable's name to its unit."""
+        """Open the record.
 
-    def record(self, first: int, columns: Mapping[str, Array], status: Sequence[str]) -> None:
-        """Append K samples from number `first` on; the loop overwrites the arrays later.
+        Args:
+            scenario: of the run.
+            controller: that runs.
+            seed: of the run.
+            steps: number of its samples.
+            units: of the FMU's variables, by name.
+        """
 
-        `columns` maps each name in `trajectory.SIGNALS` to its values, (K,) or for a vector (K, n);
-        `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m), NaN where the controller
-        gave none, are there unless it never did. `status` are K words.
+    def record(
+        self,
+        first: int,
+        columns: Mapping[str, Array],
+        status: Sequence[str],
+    ) -> None:
+        """Append K samples; the loop overwrites the arrays later.
+
+        Args:
+            first: number of the first of them.
+            columns: values by the names of `trajectory.SIGNALS`, (K,) or for a vector (K, n);
+                `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m), NaN where the
+                controller gave none, are there unless it never did.
+            status: a word for each sample.
         """
 
     def close(self) -> None:

@@ -19,7 +19,12 @@ TextTable = tuple[str, Sequence[str], list[list[str]]]
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table of texts as CSV, lines ended by one newline."""
+    """A table of texts as CSV, lines ended by one newline.
+
+    Args:
+        header: titles of the columns.
+        rows: of texts.
+    """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header)
@@ -28,9 +33,17 @@ def csv_text(header: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; the first column is text, the others are numbers."""
+    """A Markdown table; the first column is text, the others are numbers.
+
+    Args:
+        header: titles of the columns.
+        rows: of texts.
+    """
     rule = ["---", *["---:"] * (len(header) - 1)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (header, rule, *rows)) + "\n"
+    text = ""
+    for line in (header, rule, *rows):
+        text += f"| {' | '.join(line)} |\n"
+    return text
 
 
 def short(value: object) -> str:
@@ -46,17 +59,18 @@ class Shown:
         return {}
 
     def __repr__(self) -> str:
-        facts = ", ".join(f"{key}={short(value)}" for key, value in self._facts().items())
-        return f"{type(self).__name__}({facts})"
+        facts = [f"{key}={short(value)}" for key, value in self._facts().items()]
+        return f"{type(self).__name__}({', '.join(facts)})"
 
     def _repr_html_(self) -> str:
         from html import escape  # noqa: PLC0415 - it takes 10 ms of every command's start
 
-        rows = "".join(
-            f'<tr><th style="text-align:left">{escape(key)}</th>'
-            f'<td style="text-align:left">{escape(short(value))}</td></tr>'
-            for key, value in self._facts().items()
-        )
+        rows = ""
+        for key, value in self._facts().items():
+            rows += (
+                f'<tr><th style="text-align:left">{escape(key)}</th>'
+                f'<td style="text-align:left">{escape(short(value))}</td></tr>'
+            )
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
 

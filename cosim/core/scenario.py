@@ -216,17 +216,25 @@ class Penalty:
 
     Source: paper.tex, Simulations (b_σ = 10⁵·1, B_σ = I, at the true bounds).
 
-    `lower` and `upper` (n,) are the bounds x_l, x_u in the states' units, `linear` and `quadratic`
-    (n,) the weights b (cost per unit) and B (cost per unit²).
+    Args:
+        lower: bounds x_l in the states' units, (n,).
+        upper: bounds x_u, (n,).
+        linear: weights b, cost per unit, (n,).
+        quadratic: weights B, cost per unit², (n,).
     """
 
     def __init__(
-        self, lower: ArrayLike, upper: ArrayLike, linear: ArrayLike, quadratic: ArrayLike
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        linear: ArrayLike,
+        quadratic: ArrayLike,
     ) -> None:
         self.lower = np.asarray(lower, dtype=float)
         self.upper = np.asarray(upper, dtype=float)
         self.linear = np.asarray(linear, dtype=float)
         self.quadratic = np.asarray(quadratic, dtype=float)
+        # Python's numbers: for a few states they are faster than arrays.
         columns = np.array([self.lower, self.upper, self.linear, self.quadratic])
         self._rows = [(i, *row) for i, row in enumerate(columns.T.tolist())]
 
@@ -235,6 +243,7 @@ class Penalty:
         total = 0.0
         for i, lower, upper, linear, quadratic in self._rows:
             x = state[i]
+            # The common case first; a NaN goes on and makes the total one.
             if lower <= x <= upper:
                 continue
             v = lower - x if x < lower else x - upper
@@ -244,10 +253,11 @@ class Penalty:
     def along(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Penalty of each of K states (K, n), to the bits of a call."""
         total = np.zeros(len(states))
-        for v, linear, quadratic in zip(
-            self.violation(states).T, self.linear, self.quadratic, strict=True
-        ):
-            total += linear * v + quadratic * v * v
+        violations = self.violation(states)
+        # State by state and in this order, as a call adds them up.
+        for i, linear in enumerate(self.linear):
+            v = violations[:, i]
+            total += linear * v + self.quadratic[i] * v * v
         return total
 
     def violation(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -288,18 +298,32 @@ class Scenario(Shown, Table):
 
     @model_validator(mode="after")
     def _sizes_and_signs_fit(self) -> Self:
-        plant, mapping, law = self.plant, self.plant.mapping, self.disturbance.law
-        sizes = {
-            kind: len(getattr(plant, f"{kind}s")) for kind in ("state", "action", "disturbance")
-        }
-        explores = self.exploration is not None and self.exploration.kind != "none"
-        for field, of, optional in (
+        self._check_sizes()
+        self._check_bounds()
+        self._check_times()
+        plant = self.plant
+        law = self.disturbance.law
+        names = (*plant.states, *plant.actions, *plant.disturbances)
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(
+                    f"plant: names '{name}' twice among states, actions and disturbances"
+                )
+        if law != "none" and not (plant.mapping.law and law in plant.mapping.law_codes):
+            raise ValueError(f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes")
+        return self
+
+    def _check_sizes(self) -> None:
+        """Raise ValueError where a list has not one entry per state, action or disturbance."""
+        without_law = self.disturbance.law == "none"
+        # Field, what it has an entry for, and whether it may be empty.
+        rules = [
             ("plant.initial_state", "state", False),
             ("plant.mapping.initial_state", "state", True),
             ("plant.mapping.nominal", "disturbance", True),
             ("plant.mapping.ranges", "disturbance", True),
-            ("disturbance.nominal", "disturbance", law == "none"),
-            ("disturbance.ranges", "disturbance", law == "none"),
+            ("disturbance.nominal", "disturbance", without_law),
+            ("disturbance.ranges", "disturbance", without_law),
             ("bounds.state_lower", "state", False),
             ("bounds.state_upper", "state", False),
             ("bounds.action_lower", "action", False),
@@ -308,33 +332,46 @@ class Scenario(Shown, Table):
             ("penalty.quadratic", "state", False),
             ("controller.reference_state", "state", False),
             ("controller.reference_action", "action", False),
-            *([("exploration.standard_deviation", "action", False)] if explores else []),
-        ):
+        ]
+        if self.exploration is not None and self.exploration.kind != "none":
+            rules.append(("exploration.standard_deviation", "action", False))
+        sizes = {
+            "state": len(self.plant.states),
+            "action": len(self.plant.actions),
+            "disturbance": len(self.plant.disturbances),
+        }
+        for field, kind, optional in rules:
             entries = len(attrgetter(field)(self))
-            if entries != sizes[of] and not (optional and not entries):
-                raise ValueError(
-                    f"{field}: must have one entry per {of} (plant.{of}s has {sizes[of]}), "
-                    f"not {entries}"
-                )
+            if entries == sizes[kind] or (optional and not entries):
+                continue
+            raise ValueError(
+                f"{field}: must have one entry per {kind} (plant.{kind}s has {sizes[kind]}), "
+                f"not {entries}"
+            )
+
+    def _check_bounds(self) -> None:
+        """Raise ValueError where a lower bound is not below the upper one."""
         for name, (lower, upper) in self.limits.items():
+            # Written so that no number is refused, too.
             if not lower < upper:
-                kind = "state" if name in plant.states else "action"
+                kind = "state" if name in self.plant.states else "action"
                 raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper for '{name}'")
+
+    def _check_times(self) -> None:
+        """Raise ValueError where steps, start and stop, or the changes do not fit."""
+        plant = self.plant
+        # Within rounding: 0.3 s in steps of 0.1 s are 2.9999999999999996.
         steps = self.sampling_time / (plant.communication_step or self.sampling_time)
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
             raise ValueError("plant.communication_step: must be a divisor of sampling_time")
-        start, stop = plant.start_time, plant.stop_time
+        start = plant.start_time
+        stop = plant.stop_time
         if start is not None and stop is not None and stop <= start:
             raise ValueError("plant.stop_time: must be after plant.start_time")
         times = [change.time for change in plant.changes or ()]
-        if any(first >= second for first, second in pairwise(times)):
-            raise ValueError("plant.changes: must have increasing times")
-        names = (*plant.states, *plant.actions, *plant.disturbances)
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise ValueError(f"plant: names '{twice}' twice among states, actions and disturbances")
-        if law != "none" and not (mapping.law and law in mapping.law_codes):
-            raise ValueError(f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes")
-        return self
+        for time, next_time in pairwise(times):
+            if time >= next_time:
+                raise ValueError("plant.changes: must have increasing times")
 
     def _facts(self) -> dict[str, object]:
         plant = self.plant
@@ -355,11 +392,20 @@ class Scenario(Shown, Table):
         `random-SEED` is the evaporator with the random errors of a seed, see `random_plant`.
         A document with `extends = NAME_OR_PATH` states only what differs from another one.
         """
-        return cls.from_dict(*read(source))
+        document, origin = read(source)
+        return cls.from_dict(document, origin)
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], origin: str = "scenario") -> Scenario:
-        """Validate a document, structured like the TOML file; raises ScenarioError."""
+        """Validate a document.
+
+        Args:
+            document: structured like the TOML file.
+            origin: what messages call it.
+
+        Raises:
+            ScenarioError: in one line that names the field.
+        """
         return validated(cls, document, origin, ScenarioError)
 
     def replace(self, changes: Mapping[str, Any]) -> Scenario:
@@ -376,6 +422,7 @@ class Scenario(Shown, Table):
         """
         document = self.to_dict()
         plant = document["plant"]
+        # In the order of their times, so that a later one replaces an earlier one.
         for change in plant.pop("changes", ()):
             if change["time"] <= time:
                 plant["parameters"] |= change["parameters"]
@@ -399,8 +446,10 @@ class Scenario(Shown, Table):
         Left out: name, description, and the folder of a foreign FMU (its file name counts).
         """
         document = self.to_dict()
-        del document["name"], document["description"]
+        del document["name"]
+        del document["description"]
         document["plant"]["fmu"] = Path(self.plant.fmu).name
+        # One text for one content, whatever the order of a file's keys.
         canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -426,10 +475,12 @@ class Scenario(Shown, Table):
     @cached_property
     def limits(self) -> dict[str, tuple[float, float]]:
         """Lower and upper bound of each state and action by name."""
-        names, bounds = (*self.plant.states, *self.plant.actions), self.bounds
+        bounds = self.bounds
+        names = (*self.plant.states, *self.plant.actions)
         lower = (*bounds.state_lower, *bounds.action_lower)
         upper = (*bounds.state_upper, *bounds.action_upper)
-        return dict(zip(names, zip(lower, upper, strict=True), strict=True))
+        pairs = zip(lower, upper, strict=True)
+        return dict(zip(names, pairs, strict=True))
 
     @cached_property
     def state_penalty(self) -> Penalty:
@@ -452,7 +503,12 @@ def presets() -> list[str]:
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The document with some fields changed: tables are merged, everything else is replaced."""
+    """A document with some fields changed: tables are merged, everything else is replaced.
+
+    Args:
+        base: the document.
+        changes: what is changed, structured as it.
+    """
     result = dict(base)
     for key, value in changes.items():
         old = result.get(key)
@@ -465,6 +521,17 @@ RANDOM = re.compile(r"random-(0|[1-9]\d{0,8})")
 """Name of the plant with random errors that a seed draws, `random-7` say."""
 
 
+RANDOM_PARAMETERS = (
+    ("UA2", 6.84, 0.8, 1.3),
+    ("C", 4.0, 0.8, 1.3),
+    ("F3", 50.0, 0.95, 1.05),
+    ("Cp", 0.07, 0.95, 1.05),
+    ("lambda_", 38.5, 0.97, 1.03),
+    ("lambda_s", 36.6, 0.97, 1.03),
+)
+"""Parameters of the random evaporator: name, value, and the range of its factor."""
+
+
 def random_plant(seed: int) -> dict[str, Any]:
     """The changes of `paper` that make a plant with random errors, unknown to its controller.
 
@@ -473,84 +540,110 @@ def random_plant(seed: int) -> dict[str, Any]:
     disturbances by ±5 %; the law, uniform or normal; the disturbances' standard deviations by a
     factor of 0.5 … 2, common to all, log-uniform.
     """
-    rng, paper = np.random.default_rng(seed), read("paper")[0]
+    rng = np.random.default_rng(seed)
+    paper, _ = read("paper")
     sampling_time = float(rng.choice([30.0, 60.0, 120.0]))
-    parameters = {
-        name: _rounded(value * rng.uniform(low, high))
-        for name, value, low, high in (
-            ("UA2", 6.84, 0.8, 1.3),
-            ("C", 4.0, 0.8, 1.3),
-            ("F3", 50.0, 0.95, 1.05),
-            ("Cp", 0.07, 0.95, 1.05),
-            ("lambda_", 38.5, 0.97, 1.03),
-            ("lambda_s", 36.6, 0.97, 1.03),
-        )
-    }
+    parameters = {}
+    for name, value, low, high in RANDOM_PARAMETERS:
+        parameters[name] = _four_digits(value * rng.uniform(low, high))
     law = paper["disturbance"]
-    nominal = [_rounded(value * rng.uniform(0.95, 1.05)) for value in law["nominal"]]
+    nominal = [_four_digits(value * rng.uniform(0.95, 1.05)) for value in law["nominal"]]
     kind = str(rng.choice(["uniform", "normal"]))
-    factor = 2.0 ** rng.uniform(-1.0, 1.0) / (1.0 if kind == "uniform" else math.sqrt(3.0))
-    ranges = [_rounded(value * factor) for value in law["ranges"]]
+    factor = 2.0 ** rng.uniform(-1.0, 1.0)
+    # A uniform law of half width r has the standard deviation r/√3.
+    if kind == "normal":
+        factor /= math.sqrt(3.0)
+    ranges = [_four_digits(value * factor) for value in law["ranges"]]
     return {
         "name": f"random-{seed}",
         "description": f"The evaporator with the random errors that seed {seed} draws; the "
         "controller is not told",
         "sampling_time": sampling_time,
-        "plant": paper["plant"] | {"parameters": parameters},
+        "plant": {**paper["plant"], "parameters": parameters},
         "disturbance": {"law": kind, "nominal": nominal, "ranges": ranges},
     }
 
 
-def _rounded(value: float) -> float:
+def _four_digits(value: float) -> float:
+    """A number rounded to four significant digits."""
     return float(f"{value:.4g}")
 
 
 def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any], str]:
-    """Read a preset or file and what it extends; returns the document and its origin's name.
+    """Read a preset or file and what it extends.
 
-    `seen` are the files that led here. An FMU's relative path is made absolute, as seen from the
-    file that names it. Raises ScenarioError.
+    Args:
+        source: a preset's name, `random-SEED`, or the path of a TOML file.
+        seen: files that led here.
+
+    Returns:
+        The document, an FMU's path as seen from the file that names it, and what messages call it.
+
+    Raises:
+        ScenarioError: there is no such scenario, or it is not readable.
     """
     if not isinstance(source, str | Path):
         raise ScenarioError(
             f"a scenario is a preset's name or a path, not a {type(source).__name__}"
         )
-    path, origin = Path(source), f"scenario file '{source}'"
-    if (drawn := RANDOM.fullmatch(str(source))) is not None:
-        return read("paper")[0] | random_plant(int(drawn[1])), f"preset '{source}'"
+    random = RANDOM.fullmatch(str(source))
+    if random is not None:
+        paper, _ = read("paper")
+        return paper | random_plant(int(random[1])), f"preset '{source}'"
+    path = Path(source)
+    origin = f"scenario file '{source}'"
     if str(source) in presets():
-        path, origin = PRESETS / f"{source}.toml", f"preset '{source}'"
+        path = PRESETS / f"{source}.toml"
+        origin = f"preset '{source}'"
     elif path.suffix != ".toml" and len(path.parts) < 2:
         raise ScenarioError(
             f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
             f"{', '.join(presets())} and random-SEED, or give the path of a TOML file"
         )
     document = read_toml(path, origin, ScenarioError)
-    where = path.resolve()
+    place = path.resolve()
+    # A file's `module:factory` may lie beside it.
     if path.parent != PRESETS:
-        import_from(where.parent)  # its `module:factory` may lie beside it
-    return resolved(document, origin, where.parent, (*seen, str(where))), origin
+        import_from(place.parent)
+    return resolved(document, origin, place.parent, (*seen, str(place))), origin
 
 
 def resolved(
-    document: Mapping[str, Any], origin: str, folder: Path, seen: tuple[str, ...] = ()
+    document: Mapping[str, Any],
+    origin: str,
+    folder: Path,
+    seen: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The document with all that it `extends`, its paths made absolute as seen from `folder`.
+    """A document with all that it `extends`, and absolute paths.
 
-    `seen` are the files that led here. Raises ScenarioError.
+    Args:
+        document: as it stands in a file.
+        origin: what messages call it.
+        folder: from which its relative paths are seen.
+        seen: files that led here.
+
+    Raises:
+        ScenarioError: what it extends is no scenario, or leads back to it.
     """
+    # Nothing is validated yet: any value may be of any kind.
     result = copy.deepcopy(dict(document))
     plant = result.get("plant")
-    if isinstance(plant, dict) and isinstance(fmu := plant.get("fmu"), str) and is_file(fmu):
-        plant["fmu"] = str(folder / fmu)
-    if (base := result.pop("extends", None)) is None:
+    if isinstance(plant, dict):
+        fmu = plant.get("fmu")
+        if isinstance(fmu, str) and is_file(fmu):
+            plant["fmu"] = str(folder / fmu)
+    base = result.pop("extends", None)
+    if base is None:
         return result
     if not isinstance(base, str):
         raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
     if base not in presets() and not RANDOM.fullmatch(base):
         base = str(folder / base)
+    # The system's calls take no such path.
     if "\0" in base:
         raise ScenarioError(f"{origin}: extends must not hold a null byte")
     if str(Path(base).resolve()) in seen:
         raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
-    return merged(read(base, seen)[0], result)
+    # Depth first: the base has been resolved as seen from its own folder.
+    base_document, _ = read(base, seen)
+    return merged(base_document, result)

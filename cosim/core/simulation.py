@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from cosim.core.errors import CosimError, PlantError, RunEndedError
+from cosim.core.loop import ClosedLoop, Sample, controller_name
 from cosim.core.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
-from cosim.core.scenario import Scenario
 from cosim.core.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
 from cosim.core.validation import whole_number
 
@@ -50,37 +50,43 @@ def simulate(
     progress: Callable[[int], None] | bool = False,
     residuals: bool = True,
 ) -> Trajectory:
-    """Run a controller on a plant for `steps` samples from the scenario's initial state.
+    """Run a controller on a plant from the scenario's initial state (`ClosedLoop`).
 
-    Each sample: `prepare`, then `feedback(s)`, then the plant steps under the action, saturated to
-    the scenario's bounds. `recorder` gets the run in parts; `progress` the number of samples done;
-    True draws a bar. Without `residuals` the KKT residuals, which may cost time, are NaN.
+    A failed solve is counted; every other error is raised.
 
-    A failed solve is an exception whose class has `is_solver_failure`. The last applied action
-    (first the scenario's reference action) is then applied again, the failure is counted, and the
-    controller is reset. Every other error is raised; where the plant fails in mid run it is a
-    RunEndedError, whose `trajectory` has the samples before.
+    Args:
+        plant: what is controlled.
+        controller: the feedback law.
+        steps: number of samples.
+        seed: of the plant's noise (`spawn_seeds`).
+        recorder: gets the run in parts.
+        progress: gets the number of samples done; True draws a bar.
+        residuals: whether the KKT residuals, which may cost time, are asked for; else they are NaN.
+
+    Returns:
+        The samples.
+
+    Raises:
+        RunEndedError: the plant failed in mid run; its `trajectory` has the samples before.
     """
     steps = whole_number("steps", steps, 1, CosimError)
+    # The columns are there before the recorder opens its file: they may not fit the memory.
     run = _Run(plant, controller, steps, seed, residuals)
     if recorder is not None:
         recorder.start(plant.scenario, controller, seed, steps, plant.units)
-    loop: CompiledLoop | None = None
-    drives = recorder is None and hasattr(type(plant), "drive")
-    drives = drives and getattr(plant, "drivable", False)
-    if drives and hasattr(type(controller), "compiled_loop"):
-        # The classes' own methods, not a wrapper's.
-        loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
+    # A recorder reads the predictions, which a compiled loop does not keep.
+    loop = compiled_loop(plant, controller) if recorder is None else None
     try:
-        with reporting(progress, plant.scenario.name, steps) as tell:
+        with reporting(progress, plant.scenario.name, steps) as report:
             if loop is not None:
-                run.compiled(loop, tell)
+                run.compiled(loop, report)
             elif recorder is None:
-                run.interpreted(None, tell)
+                run.interpreted(None, report)
             else:
                 with closing(recorder):
-                    run.interpreted(recorder.record, tell)
+                    run.interpreted(recorder.record, report)
     except PlantError as error:
+        # Of a plant that fails at once there is nothing to show.
         if run.done == 0:
             raise
         ended = RunEndedError(f"{error}; the run ended after {run.done} of {steps} samples")
@@ -89,100 +95,144 @@ def simulate(
     return run.trajectory()
 
 
+def compiled_loop(plant: Plant, controller: Controller) -> CompiledLoop | None:
+    """The loop of both in compiled code; None where one of them has to be asked in Python.
+
+    Args:
+        plant: what is controlled.
+        controller: the feedback law.
+    """
+    # Methods of the classes: a wrapper that hands on all attributes samples in a way of its own.
+    if not hasattr(type(plant), "drive") or not hasattr(type(controller), "compiled_loop"):
+        return None
+    if not getattr(plant, "drivable", False):
+        return None
+    loop: CompiledLoop | None = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
+    return loop
+
+
 class _Run:
-    """One run, and the loop that fills its columns."""
+    """One run, and the loop that fills its columns.
+
+    Attributes:
+        done: number of samples that are stored.
+    """
 
     def __init__(
-        self, plant: Plant, controller: Controller, steps: int, seed: int, residuals: bool
+        self,
+        plant: Plant,
+        controller: Controller,
+        steps: int,
+        seed: int,
+        residuals: bool,
     ) -> None:
-        self._plant, self._controller = plant, controller
-        self._scenario: Scenario = plant.scenario
-        self._seed, self._steps, self._residuals = seed, steps, residuals
+        scenario = plant.scenario
+        self._plant = plant
+        self._controller = controller
+        self._loop = ClosedLoop(plant.step, controller, scenario)
+        self._scenario = scenario
+        self._seed = seed
+        self._steps = steps
+        self._residuals = residuals
         self._length = min(max(PART, steps // 200), 10 * PART)
-        widths = {kind.name: len(kind.names(self._scenario)) for kind in SIGNALS}
+        self._columns: dict[str, Array] = {}
+        widths = {}
+        for kind in SIGNALS:
+            widths[kind.name] = len(kind.names(scenario))
+            # Column-major, so that a signal is a column and not a copy of one. What is never
+            # written takes no memory; a clock is not as precise as a float of 32 bits.
+            shape = (steps, widths[kind.name]) if kind.vector else (steps,)
+            dtype = np.float32 if kind.clock else np.float64
+            self._columns[kind.name] = np.zeros(shape, dtype, order="F")
         self._ends = np.cumsum([widths[name] for name in MEASURED])
-        # Column-major, so that a signal is a column and not a copy of one. What is never written
-        # takes no memory; a clock is not as precise as a float of 32 bits.
-        self._columns: dict[str, Array] = {
-            kind.name: np.zeros(
-                (steps, widths[kind.name]) if kind.vector else steps,
-                np.float32 if kind.clock else np.float64,
-                order="F",
-            )
-            for kind in SIGNALS
-        }
         self._status: list[str] = []
         self._predicted: dict[str, Array] = {}
         self._final_state: Array | None = None
         self.done = 0
-        """Number of samples that are stored."""
 
     def interpreted(
         self, record: Callable[..., None] | None, progress: Callable[[int], None]
     ) -> None:
-        plant, rows = self._plant, list[list[float]]()
-        s = plant.reset(spawn_seeds(self._seed)[0])
-        self._controller.reset()
-        applied = self._scenario.reference_action
+        """Run the loop in Python.
+
+        Args:
+            record: gets each part of the run; None: nobody does.
+            progress: is called with the number of samples done.
+        """
+        rows: list[list[float]] = []
+        loop = self._loop
+        loop.start(self._plant.reset(spawn_seeds(self._seed)[0]))
         try:
             for k in range(self._steps):
-                s.flags.writeable = False  # for the controller
-                solution, prepare_time, feedback_time = self._solve(s)
-                applied = self._applied(applied if solution is None else solution.action, k)
-                begin = perf_counter()
-                step = plant.step(applied)
-                plant_time = perf_counter() - begin
-                value = residual = nan
-                if solution is not None:
-                    value = self._number(solution, "value", k)
-                    if self._residuals:
-                        residual = self._number(solution, "residual", k)
-                row = [*s.tolist(), *applied.tolist(), step.stage_cost, *step.disturbance.tolist()]
-                row += [value, residual, solution is None, prepare_time, feedback_time, plant_time]
-                rows.append(row)
-                s = step.s
+                sample = loop.advance()
+                rows.append(self._row(sample))
+                solution = sample.solution
+                self._status.append(FALLBACK if solution is None else solution.status)
                 if record is not None and solution is not None:
                     self._keep_prediction(k, solution)
                 if (k + 1) % self._length == 0 or k + 1 == self._steps:
                     self._store(rows, record)
                     progress(k + 1)
         except PlantError:
-            self._store(rows, record)  # the samples before
+            # The samples before.
+            self._store(rows, record)
             raise
         finally:
-            self._final_state = s
+            self._final_state = loop.s
 
-    def _applied(self, action: object, k: int) -> Array:
-        """The action within the actuators' bounds; raises CosimError where it is none."""
-        shape = self._scenario.action_lower.shape
-        if isinstance(action, np.ndarray) and action.dtype.kind in "fiu":
-            if action.shape == shape:
-                return self._scenario.saturate(action)
-            given = f"shape {action.shape}"
-        else:
-            given = f"{type(action).__name__} {action}"
-        raise self._wrong(f"an action of {given}, not {shape}", k)
+    def _row(self, sample: Sample) -> list[float]:
+        """A sample's row of the table, in the order of `MEASURED`."""
+        solution = sample.solution
+        step = sample.step
+        value = residual = nan
+        if solution is not None:
+            value = self._number(solution, "value")
+            if self._residuals:
+                residual = self._number(solution, "residual")
+        return [
+            *sample.s.tolist(),
+            *sample.a.tolist(),
+            step.stage_cost,
+            *step.disturbance.tolist(),
+            value,
+            residual,
+            solution is None,
+            sample.prepare_time,
+            sample.feedback_time,
+            sample.plant_time,
+        ]
 
     def _store(self, rows: list[list[float]], record: Callable[..., None] | None) -> None:
         """Store the rows that are not stored yet, hand them to the recorder, and forget them."""
         if not rows:
             return
-        first, count = self.done, len(rows)
+        first = self.done
+        count = len(rows)
+        # One conversion for a part, not one for each row.
         columns = self._fill(first, np.array(rows))
         rows.clear()
-        if record is not None:
-            predicted = {name: values[:count] for name, values in self._predicted.items()}
-            record(first, columns | predicted, self._status[first : first + count])
-            self._predicted = {}
+        if record is None:
+            return
+        for name, values in self._predicted.items():
+            columns[name] = values[:count]
+        record(first, columns, self._status[first : first + count])
+        self._predicted = {}
 
     def compiled(self, loop: CompiledLoop, progress: Callable[[int], None]) -> None:
-        """Run with the controller's loop, to the same columns."""
-        self._plant.reset(spawn_seeds(self._seed)[0])
+        """Run with a loop in compiled code, to the same columns.
+
+        Args:
+            loop: the controller's.
+            progress: is called with the number of samples done.
+        """
+        plant: Any = self._plant
+        plant.reset(spawn_seeds(self._seed)[0])
+        # In parts, so that progress is shown and Ctrl-C is heard.
         for first in range(0, self._steps, PART):
             end = min(first + PART, self._steps)
             table = np.full((end - first, self._ends[-1]), nan)
             try:
-                self._final_state = self._plant.drive(loop, table)  # type: ignore[attr-defined]
+                self._final_state = plant.drive(loop, table)
             except PlantError:
                 # The plant's time, a row's last number, is written after its step.
                 count = int(np.isfinite(table[:, -1]).sum())
@@ -194,74 +244,63 @@ class _Run:
 
     def _keep(self, first: int, table: Array) -> None:
         """Store rows of the compiled loop with their status."""
-        failed = self._fill(first, table)["failed"]
-        self._status += [FALLBACK if sample_failed else "solved" for sample_failed in failed]
+        columns = self._fill(first, table)
+        for failed in columns["failed"]:
+            self._status.append(FALLBACK if failed else "solved")
 
     def _fill(self, first: int, table: Array) -> dict[str, Array]:
         """Store rows of the signals that are `MEASURED`, and those that follow; all by name."""
-        self.done = end = first + len(table)
+        end = first + len(table)
+        self.done = end
         stored = {name: column[first:end] for name, column in self._columns.items()}
+        # k·h, never a sum of h.
         stored["time"][:] = np.arange(first, end) * self._scenario.sampling_time
         parts = np.split(table, self._ends[:-1], axis=1)
         for name, part in zip(MEASURED, parts, strict=True):
             stored[name][:] = part.reshape(stored[name].shape)
+        # A compiled loop has them at no cost; the interpreted one does not ask for them.
         if not self._residuals:
             stored["residual"][:] = nan
+        # In the order of their declaration: one may need another.
         for kind in SIGNALS:
-            if kind.of is not None:
-                stored[kind.name][:] = kind.of(self._scenario, stored)
+            if kind.derive is not None:
+                stored[kind.name][:] = kind.derive(self._scenario, stored)
         return stored
 
-    def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
-        """Prepare and feed back, timed apart; None if the controller declares a failure."""
-        controller = self._controller
-        solution: Solution | None = None
-        begin = middle = perf_counter()
-        try:
-            controller.prepare()
-            middle = perf_counter()
-            solution = controller.feedback(s)
-            end = perf_counter()
-            if not hasattr(solution, "action"):
-                raise self._wrong(f"a {type(solution).__name__}, which is no solution")
-            if not isinstance(status := getattr(solution, "status", None), str):
-                raise self._wrong(f"a status that is no text but {status!r:.60}")
-        except Exception as error:
-            end = perf_counter()
-            recover(controller, error)
-        self._status.append(FALLBACK if solution is None else solution.status)
-        return solution, middle - begin, end - middle
-
-    def _number(self, solution: Solution, name: str, k: int) -> float:
+    def _number(self, solution: Solution, name: str) -> float:
         """A field of a solution that is a number; raises CosimError where it is none."""
-        given = getattr(solution, name, None)
-        if type(given) is float:
-            return given
-        if isinstance(given, bool) or not isinstance(given, int | float | np.integer | np.floating):
-            shown = " ".join(f"{given!r:.60}".split())
-            raise self._wrong(f"a {name} that is no number but {shown}", k)
-        return float(given)
-
-    def _wrong(self, given: str, k: int | None = None) -> CosimError:
-        at = "" if k is None else f", at step {k}"
-        return CosimError(f"{controller_name(self._controller)} gave {given}{at}")
+        value = getattr(solution, name, None)
+        # Of our own controllers always, and a short way for every sample.
+        if type(value) is float:
+            return value
+        numbers = int | float | np.integer | np.floating
+        if isinstance(value, bool) or not isinstance(value, numbers):
+            shown = " ".join(f"{value!r:.60}".split())
+            number = self._loop.number - 1
+            raise self._loop.wrong(f"a {name} that is no number but {shown}", number)
+        return float(value)
 
     def _keep_prediction(self, k: int, solution: Solution) -> None:
-        given: Any = {name: getattr(solution, name) for name in PREDICTED}
-        if any(values is None for values in given.values()):
+        """Keep what a solution predicts, for the recorder, if it does."""
+        predictions: dict[str, Any] = {name: getattr(solution, name) for name in PREDICTED}
+        if any(values is None for values in predictions.values()):
             return
-        if not self._predicted:
-            shapes = {name: (self._length, *np.shape(values)) for name, values in given.items()}
-            self._predicted = {name: np.full(shape, nan) for name, shape in shapes.items()}
+        row = k % self._length
         try:
-            for name, values in given.items():
-                self._predicted[name][k % self._length] = values
+            for name, values in predictions.items():
+                if name not in self._predicted:
+                    shape = (self._length, *np.shape(values))
+                    self._predicted[name] = np.full(shape, nan)
+                self._predicted[name][row] = values
         except (TypeError, ValueError) as error:
-            raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
+            wrong = self._loop.wrong(f"a prediction of another shape or kind ({error})", k)
+            raise wrong from None
 
     def trajectory(self) -> Trajectory:
+        """The samples that are stored."""
         scenario = self._scenario
-        named, timing = {}, {}
+        signals: dict[str, Signal] = {}
+        timing = {}
         for kind in SIGNALS:
             values = self._columns[kind.name].reshape(self._steps, -1)[: self.done]
             if kind.clock:
@@ -269,10 +308,10 @@ class _Run:
                 continue
             units = kind.units(scenario, self._plant.units)
             for (name, unit), column in zip(units.items(), values.T, strict=True):
-                named[name] = Signal(name, unit, np.ascontiguousarray(column))
+                signals[name] = Signal(name, unit, np.ascontiguousarray(column))
         return Trajectory(
             scenario=scenario,
-            signals=named,
+            signals=signals,
             status=self._status[: self.done],
             timing=timing,
             final_state=self._final_state,
@@ -281,70 +320,97 @@ class _Run:
         )
 
 
-def recover(controller: Controller, error: Exception) -> None:
-    """Reset a controller that declared this failure; raise every other error."""
-    if not getattr(type(error), "is_solver_failure", False):
-        raise error
-    controller.reset()
-
-
 def functions_of(controller: Any) -> str | None:
     """How a controller's functions are computed, `interpreted` or `compiled`; None without any."""
     mode = getattr(controller, "functions", None)
     return mode if isinstance(mode, str) else None
 
 
-def controller_name(controller: Any) -> str:
-    """Name of a controller for tables: its `name`, else its class's."""
-    return str(getattr(controller, "name", type(controller).__name__))
-
-
-# key performance indicators of a run
-
-
 def indicators(run: Trajectory, burn_in: int = 0) -> dict[str, float]:
-    """Indicators of a run after its first `burn_in` samples.
+    """Key performance indicators of a run.
 
     They are `Trajectory.means`, `input_effort` and `failures`, the samples under the fallback.
+
+    Args:
+        run: its samples.
+        burn_in: samples at the start that do not count.
     """
-    lower, upper = run.scenario.action_lower, run.scenario.action_upper
-    return run.means(burn_in) | {
-        "input_effort": input_effort(run.actions[burn_in:], lower, upper),
-        "failures": float(np.sum(run["failed"][burn_in:])),
-    }
+    scenario = run.scenario
+    actions = run.actions[burn_in:]
+    values = run.means(burn_in)
+    values["input_effort"] = input_effort(actions, scenario.action_lower, scenario.action_upper)
+    values["failures"] = float(np.sum(run["failed"][burn_in:]))
+    return values
 
 
 def measure(
-    plant: Plant, controller: Controller, seed: int, steps: int, burn_in: int = 0
+    plant: Plant,
+    controller: Controller,
+    seed: int,
+    steps: int,
+    burn_in: int = 0,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Indicators of `steps` samples after `burn_in` on a seed's noise, and times.
+    """Run a controller on a seed's noise.
 
-    Times are `wall_time_s` and quantiles of each phase of a sample in µs.
+    Args:
+        plant: what is controlled.
+        controller: the feedback law.
+        seed: of the noise.
+        steps: samples that count.
+        burn_in: samples before these.
+
+    Returns:
+        The `indicators`; and times, `wall_time_s` and quantiles of each phase of a sample in µs.
     """
     begin = perf_counter()
     run = simulate(plant, controller, burn_in + steps, seed, residuals=False)
     clock = {"wall_time_s": perf_counter() - begin}
-    for name, quantiles in run.timing_summary().items():
-        clock |= {f"{name}_{key}": value for key, value in quantiles.items()}
+    for phase, quantiles in run.timing_summary().items():
+        for name, value in quantiles.items():
+            clock[f"{phase}_{name}"] = value
     return indicators(run, burn_in), clock
 
 
 def indicators_of(
-    plant: Plant, controller: Controller, seeds: Sequence[int], steps: int
+    plant: Plant,
+    controller: Controller,
+    seeds: Sequence[int],
+    steps: int,
 ) -> dict[str, Array]:
-    """`indicators` of a controller on each of S seeds by name, (S,) each."""
-    found = [measure(plant, controller, seed, steps)[0] for seed in seeds]
-    return {name: np.array([figures[name] for figures in found]) for name in found[0]}
+    """`indicators` of a controller on several seeds.
+
+    Args:
+        plant: what is controlled.
+        controller: the feedback law.
+        seeds: of the noise, S of them.
+        steps: samples of each run.
+
+    Returns:
+        Values (S,) by name.
+    """
+    rows = [measure(plant, controller, seed, steps)[0] for seed in seeds]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def input_effort(actions: Array, lower: Array, upper: Array) -> float:
+def input_effort(
+    actions: Array,
+    lower: Array,
+    upper: Array,
+) -> float:
     """Mean over samples of Σᵢ |uᵢ,ₖ − uᵢ,ₖ₋₁| / (u_u − u_l)ᵢ, the share of the range moved.
 
-    `actions` (K, m); `lower`, `upper` (m,). One sample moves nothing: 0.
+    Args:
+        actions: u, (K, m).
+        lower: u_l, (m,).
+        upper: u_u, (m,).
+
+    Returns:
+        0 for one sample, which moves nothing.
     """
     if len(actions) < 2:
         return 0.0
-    return float(np.mean(np.sum(np.abs(np.diff(actions, axis=0)) / (upper - lower), axis=1)))
+    moves = np.abs(np.diff(actions, axis=0)) / (upper - lower)
+    return float(np.mean(np.sum(moves, axis=1)))
 
 
 @contextmanager
@@ -363,6 +429,7 @@ def reporting(
         read: turns what the callback is called with into the number done and a remark.
     """
     if callable(progress) or not progress:
+        # Whoever reports need not know whether anybody listens.
         yield progress or (lambda *news: None)
         return
     from rich import progress as rich_progress  # noqa: PLC0415, only where a bar is drawn

@@ -37,127 +37,220 @@ class Estimate(NamedTuple):
 
 
 def mean(values: Array) -> Estimate:
-    """Mean of S independent values, (S,), with Student's interval; none for one value."""
+    """Mean of S independent values (S,), with Student's interval; none for one value."""
     value = float(np.mean(values))
     return Estimate(value, _t_interval(values, value))
 
 
 def ratio(numerator: Array, denominator: Array) -> Estimate:
-    """Ratio of the means of S paired values, (S,) each; NaN where the denominator's mean is zero.
+    """Ratio of the means of S paired values.
 
-    The interval is Student's of the linearised ratio (delta method): residuals (aₛ − r bₛ)/mean(b).
+    The interval is Student's of the linearised ratio (delta method): of (aₛ − r bₛ)/mean(b).
+
+    Args:
+        numerator: a, (S,).
+        denominator: b, (S,).
+
+    Returns:
+        The ratio; NaN where the denominator's mean is zero.
     """
     below = float(np.mean(denominator))
     value = float(np.mean(numerator)) / below if below else float("nan")
-    with np.errstate(invalid="ignore"):  # an infinite cost has no interval
-        residuals = (numerator - value * denominator) / (below or 1.0)
-    return Estimate(value, _t_interval(residuals, value))
+    # An infinite cost has no interval.
+    with np.errstate(invalid="ignore"):
+        linearised = (numerator - value * denominator) / (below or 1.0)
+    return Estimate(value, _t_interval(linearised, value))
 
 
 def bootstrapped(numerator: Array, denominator: Array) -> Interval:
     """BCa bootstrap interval of `ratio`, resampling seeds, for skewed costs.
 
-    None for one seed, for more than `RESAMPLED`, and where a value is not finite.
+    Args:
+        numerator: (S,).
+        denominator: (S,).
+
+    Returns:
+        None for one seed, for more than `RESAMPLED`, and where a value is not finite.
     """
-    seeds, total = len(numerator), np.sum(denominator)
+    seeds = len(numerator)
+    total = np.sum(denominator)
     if not 2 <= seeds <= RESAMPLED or not np.isfinite(numerator).all() or not total:
         return None
     value = float(np.sum(numerator) / total)
-    without = (np.sum(numerator) - numerator) / (total - denominator)
+    without_one = (np.sum(numerator) - numerator) / (total - denominator)
     # BCa is undefined where no seed counts.
-    if np.ptp(without) <= NEGLIGIBLE * max(1.0, abs(value)):
+    if _all_equal(without_one, value):
         return value, value
 
-    def quotient(above: Array, below: Array, axis: int) -> Any:
+    def quotient(
+        above: Array,
+        below: Array,
+        axis: int,
+    ) -> Any:
         return np.mean(above, axis=axis) / np.mean(below, axis=axis)
 
     return _bootstrap((numerator, denominator), quotient, paired=True, method="BCa")
 
 
+def _all_equal(values: Array, level: float) -> bool:
+    """Whether values differ by rounding alone, at a mean of about `level`."""
+    return bool(np.ptp(values) <= NEGLIGIBLE * max(1.0, abs(level)))
+
+
 def _bootstrap(data: Sequence[Array], statistic: Callable[..., Any], **options: Any) -> Interval:
     """Interval of a statistic of resampled data, with a fixed seed."""
-    found = stats.bootstrap(
+    longest = max(len(values) for values in data)
+    interval = stats.bootstrap(
         tuple(data),
         statistic,
         n_resamples=RESAMPLES,
-        batch=max(1, AT_ONCE // max(map(len, data))),
+        batch=max(1, AT_ONCE // longest),
         confidence_level=LEVEL,
         rng=np.random.default_rng(0),
         **options,
     ).confidence_interval
-    return float(found.low), float(found.high)
+    return float(interval.low), float(interval.high)
 
 
 def regret(cost: Array, optimum: Array) -> Estimate:
-    """(J − J*)/|J*|, as a ratio of means; `cost` and `optimum` (S,) are J of each seed."""
+    """(J − J*)/|J*|, as a ratio of means.
+
+    Args:
+        cost: J of each seed, (S,).
+        optimum: J* of each seed, (S,).
+    """
     return ratio(cost - optimum, magnitude(optimum))
 
 
 def gain(cost: Array, reference: Array) -> Estimate:
-    """Gain in J over a reference, (J_ref − J)/|J_ref|, as a ratio of means; both (S,)."""
+    """Gain in J over a reference, (J_ref − J)/|J_ref|, as a ratio of means.
+
+    Args:
+        cost: J of each seed, (S,).
+        reference: J_ref of each seed, (S,).
+    """
     return ratio(reference - cost, magnitude(reference))
 
 
-def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
-    """(J_naive − J)/(J_naive − J*), as a ratio of means; all (S,)."""
+def gap_closed(
+    cost: Array,
+    naive: Array,
+    optimum: Array,
+) -> Estimate:
+    """(J_naive − J)/(J_naive − J*), as a ratio of means.
+
+    Args:
+        cost: J of each seed, (S,).
+        naive: J of the untrained start, (S,).
+        optimum: J*, (S,).
+    """
     return ratio(naive - cost, naive - optimum)
 
 
 def regrets(cost: Array, optimum: Array | float) -> Array:
-    """`regret` of each seed by itself, (S,)."""
+    """`regret` of each seed by itself, (S,).
+
+    Args:
+        cost: J of each seed, (S,).
+        optimum: J*, (S,) or one for all.
+    """
     return relative(cost - optimum, optimum)
 
 
 def relative(difference: Array, optimum: Array | float) -> Array:
-    """Differences of costs in the unit of a regret, (J − J')/|J*| of each seed by itself, (S,)."""
-    return _each(difference, np.abs(optimum))
+    """Differences of costs in the unit of a regret, (J − J')/|J*| of each seed by itself, (S,).
+
+    Args:
+        difference: J − J', (S,).
+        optimum: J*, (S,) or one for all.
+    """
+    return _quotients(difference, np.abs(optimum))
 
 
 def regret_terms(cost: Array, optimum: Array) -> Array:
-    """Contribution (S,) of each seed or stretch to `regret`, their mean."""
+    """Contribution of each seed or segment to `regret`, their mean, (S,).
+
+    Args:
+        cost: J, (S,).
+        optimum: J*, (S,).
+    """
     return (cost - optimum) / abs(np.mean(optimum))
 
 
 def gains(cost: Array, reference: Array) -> Array:
-    """`gain` of each seed by itself, (S,)."""
-    return _each(reference - cost, np.abs(reference))
+    """`gain` of each seed by itself, (S,).
+
+    Args:
+        cost: J of each seed, (S,).
+        reference: J_ref of each seed, (S,).
+    """
+    return _quotients(reference - cost, np.abs(reference))
 
 
-def gaps_closed(cost: Array, naive: Array, optimum: Array) -> Array:
-    """`gap_closed` of each seed by itself, (S,)."""
-    return _each(naive - cost, naive - optimum)
+def gaps_closed(
+    cost: Array,
+    naive: Array,
+    optimum: Array,
+) -> Array:
+    """`gap_closed` of each seed by itself, (S,).
+
+    Args:
+        cost: J of each seed, (S,).
+        naive: J of the untrained start, (S,).
+        optimum: J*, (S,).
+    """
+    return _quotients(naive - cost, naive - optimum)
 
 
-def _each(numerator: Array, denominator: Array | float) -> Array:
+def _quotients(numerator: Array, denominator: Array | float) -> Array:
     """Quotients, NaN where the denominator is zero."""
-    there = denominator != 0
-    return np.where(there, numerator / np.where(there, denominator, 1.0), np.nan)
+    defined = denominator != 0
+    safe = np.where(defined, denominator, 1.0)
+    return np.where(defined, numerator / safe, np.nan)
 
 
 def interquartile_mean(values: Array, axis: int = -1) -> Any:
-    """Mean of the middle half of R values along an axis, (R,) -> scalar.
+    """Mean of the middle half of R values along an axis.
 
     Entries at a quarter of R count with their share. Source: Agarwal et al., Deep RL at the Edge of
     the Statistical Precipice.
+
+    Args:
+        values: (…, R, …).
+        axis: that of the R values.
+
+    Returns:
+        The other axes, (…); a scalar for (R,).
     """
     ordered = np.sort(np.moveaxis(values, axis, -1))
     count = ordered.shape[-1]
-    weight = np.diff(np.clip(np.arange(count + 1), 0.25 * count, 0.75 * count))
-    inside = np.where(weight > 0, ordered, 0.0)  # values outside may be infinite
+    edges = np.clip(np.arange(count + 1), 0.25 * count, 0.75 * count)
+    weight = np.diff(edges)
+    # Values outside may be infinite.
+    inside = np.where(weight > 0, ordered, 0.0)
     return (inside * weight).sum(axis=-1) / weight.sum()
 
 
 def over_runs(strata: Sequence[Array]) -> Estimate:
-    """Interquartile mean over training runs, each of `strata` (R_i,) one scenario's.
+    """Interquartile mean over training runs.
 
     The interval is a bootstrap's, which resamples the runs of each stratum by themselves, with a
-    fixed seed (percentiles). None where a run is not finite, or where there is only one.
+    fixed seed (percentiles).
+
+    Args:
+        strata: figures of the runs on each scenario, (R_i,) each.
+
+    Returns:
+        The mean; no interval where a run is not finite, or where a stratum has only one.
     """
     value = float(interquartile_mean(np.concatenate(list(strata))))
-    if any(len(runs) < 2 for runs in strata) or not all(np.isfinite(r).all() for r in strata):
-        return Estimate(value)
+    every_run_equal = True
+    for runs in strata:
+        if len(runs) < 2 or not np.isfinite(runs).all():
+            return Estimate(value)
+        every_run_equal = every_run_equal and _all_equal(runs, value)
     # Percentiles of equal numbers differ from them in the last bit on some processors.
-    if all(np.ptp(runs) <= NEGLIGIBLE * max(1.0, abs(value)) for runs in strata):
+    if every_run_equal:
         return Estimate(value, (value, value))
 
     def middle(*resampled: Array, axis: int) -> Any:
@@ -167,28 +260,49 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
 
 
 def td_error_mean(
-    samples: Array, td_error: Array, updates: Array, window: int = TD_WINDOW
+    samples: Array,
+    td_error: Array,
+    updates: Array,
+    window: int = TD_WINDOW,
 ) -> Array:
-    """Root mean square TD error over the updates of the `window` samples up to each row, (K,).
+    """Root mean square TD error over the updates of the latest samples.
 
-    `samples` (K,) is where a row of a training's log ends, `td_error` (K,) its root mean square
-    over its `updates` (K,). The first rows average over fewer samples; NaN without an update.
+    Args:
+        samples: where each row of a training's log ends, (K,).
+        td_error: root mean square TD error of each row, (K,).
+        updates: number of each row's updates, (K,).
+        window: samples that count, up to and with those of the row; the first rows have fewer.
+
+    Returns:
+        (K,), NaN where there was no update.
     """
     counts = np.where(np.isfinite(td_error), updates, 0.0)
-    squares = np.where(counts > 0, td_error, 0.0) ** 2 * counts
-    total = np.pad(np.cumsum([squares, counts], axis=1), ((0, 0), (1, 0)))
-    first = np.searchsorted(np.append(0.0, samples), samples - window, side="left")
-    above, below = total[:, 1:] - total[:, first]
-    mean = np.maximum(above, 0.0) / np.where(below > 0, below, 1.0)
-    return np.where(below > 0, np.sqrt(mean), np.nan)
+    errors = np.where(counts > 0, td_error, 0.0)
+    # Sums over a window are differences of sums from the start, which begin with 0.
+    count_sums = np.append(0.0, np.cumsum(counts))
+    square_sums = np.append(0.0, np.cumsum(errors**2 * counts))
+    ends = np.append(0.0, samples)
+    first = np.searchsorted(ends, samples - window, side="left")
+    n_updates = count_sums[1:] - count_sums[first]
+    squares = square_sums[1:] - square_sums[first]
+    # Rounding may leave a sum of squares below zero.
+    mean_square = np.maximum(squares, 0.0) / np.where(n_updates > 0, n_updates, 1.0)
+    return np.where(n_updates > 0, np.sqrt(mean_square), np.nan)
 
 
 def shown(
-    value: float, ends: Sequence[float] | None = None, scale: float = 1.0, digits: int = 5
+    value: float,
+    ends: Sequence[float] | None = None,
+    scale: float = 1.0,
+    digits: int = 5,
 ) -> str:
-    """`value [low, high]` for tables, scaled; `value` alone where there is no interval.
+    """`value [low, high]` for tables; `value` alone where there is no interval.
 
-    The value keeps `digits` significant digits and the interval's half width two.
+    Args:
+        value: what is shown.
+        ends: of its interval; None where there is none.
+        scale: factor of all three numbers.
+        digits: significant digits of the value; the interval's half width has two.
     """
     value *= scale
     if ends is None:
@@ -199,10 +313,16 @@ def shown(
 
 
 def decimals(value: float, digits: int) -> int:
-    """Decimals, 0 to 9, with which a number shows `digits` significant digits."""
+    """Decimals, 0 to 9, with which a number shows so many significant digits.
+
+    Args:
+        value: the number.
+        digits: significant ones.
+    """
     if not isfinite(value) or value == 0:
         return 0
-    return min(max(digits - 1 - floor(log10(abs(value))), 0), 9)
+    first_digit = floor(log10(abs(value)))
+    return min(max(digits - 1 - first_digit, 0), 9)
 
 
 def magnitude(reference: Array) -> Array:
@@ -210,52 +330,95 @@ def magnitude(reference: Array) -> Array:
     return -reference if float(np.mean(reference)) < 0 else reference
 
 
-def _t_interval(residuals: Array, value: float) -> Interval:
+def _t_interval(errors: Array, value: float) -> Interval:
     """Student's interval; None for fewer than two values, or where one is not finite."""
-    if len(residuals) < 2 or not np.isfinite(residuals).all():
+    if len(errors) < 2 or not np.isfinite(errors).all():
         return None
-    half = float(stats.t.ppf(0.5 + LEVEL / 2, len(residuals) - 1) * stats.sem(residuals))
+    quantile = stats.t.ppf(0.5 + LEVEL / 2, len(errors) - 1)
+    half = float(quantile * stats.sem(errors))
     return value - half, value + half
 
 
-def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float, Interval, float]:
-    """Median over R pairs of runs of (J − J')/|J*|, its interval over pairs and noise, and p.
+def paired_difference(
+    cost: Array,
+    other: Array,
+    optimum: Array,
+) -> tuple[float, Interval, float]:
+    """Median over R pairs of runs of (J − J')/|J*|.
 
-    `cost` and `other` are (R, S), `optimum` (S,). p is that of the signed ranks of the pairs'
-    differences when their signs are flipped: all 2^R ways, or 9999 for more than 12 pairs. It is
-    NaN for fewer than two pairs.
+    p is that of the signed ranks of the pairs' differences when their signs are flipped (Wilcoxon's
+    test by permutation): in all 2^R ways, or in 9999 drawn ones for more than 12 pairs.
+
+    Args:
+        cost: J of each run and noise seed, (R, S).
+        other: J' of the counterparts, (R, S).
+        optimum: J* on the same noise, (S,).
+
+    Returns:
+        The median, its interval over pairs and noise, and p, NaN for fewer than two pairs.
     """
-    below = magnitude(optimum)
-    each = (cost - other).mean(axis=1) / below.mean()
-    each = np.where(np.isnan(each), np.inf, each)  # a cost that is no number is the worst
-    ranks, count = stats.rankdata(np.abs(each)), len(each)
-    if count > 12:
-        flips = np.random.default_rng(0).choice([-1.0, 1.0], size=(RESAMPLES, count))
-    else:
-        flips = 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1) - 1
-    reached = np.abs(flips @ ranks) >= abs(float(np.sign(each) @ ranks)) - 1e-9
-    p = (1 + reached.sum()) / (1 + len(flips)) if count > 12 else reached.mean()
+    differences = (cost - other).mean(axis=1) / magnitude(optimum).mean()
+    # A cost that is no number is the worst.
+    differences = np.where(np.isnan(differences), np.inf, differences)
+    median = float(np.median(differences))
     interval = two_way(cost, optimum, other)
-    return float(np.median(each)), interval, float(p) if count > 1 else float("nan")
+    return median, interval, _sign_flip_probability(differences)
 
 
-def two_way(cost: Array, optimum: Array, other: Array | None = None) -> Interval:
+def _sign_flip_probability(differences: Array) -> float:
+    """p of the signed ranks of R differences, (R,), when their signs are flipped."""
+    count = len(differences)
+    if count < 2:
+        return float("nan")
+    ranks = stats.rankdata(np.abs(differences))
+    # Sums of ranks are multiples of a half.
+    observed = abs(float(np.sign(differences) @ ranks)) - 1e-9
+    if count > 12:
+        rng = np.random.default_rng(0)
+        flips = rng.choice([-1.0, 1.0], size=(RESAMPLES, count))
+        reached = np.abs(flips @ ranks) >= observed
+        # What was observed is one of the ways, too.
+        return float((1 + reached.sum()) / (1 + RESAMPLES))
+    # Row k has the bits of k as signs.
+    numbers = np.arange(2**count)[:, None]
+    bits = (numbers >> np.arange(count)) & 1
+    reached = np.abs((2.0 * bits - 1) @ ranks) >= observed
+    return float(reached.mean())
+
+
+def two_way(
+    cost: Array,
+    optimum: Array,
+    other: Array | None = None,
+) -> Interval:
     """Interval of the median over R runs of (J − J')/|J*|, over runs and noise together.
 
-    `cost` (R, S) is J of each run and noise seed, `optimum` (S,) J* on the same noise, `other` J',
-    (R, S), else J*. Runs and noise seeds are resampled independently (percentiles). None for one
-    seed.
+    Runs and noise seeds are resampled independently (percentiles).
+
+    Args:
+        cost: J of each run and noise seed, (R, S).
+        optimum: J* on the same noise, (S,).
+        other: J', (R, S); else J*.
+
+    Returns:
+        None for one noise seed.
     """
-    terms, below = cost - (optimum if other is None else other), magnitude(optimum)
-    runs, seeds = terms.shape
-    if seeds < 2:
+    terms = cost - (optimum if other is None else other)
+    below = magnitude(optimum)
+    n_runs, n_seeds = terms.shape
+    if n_seeds < 2:
         return None
-    rng, draws = np.random.default_rng(0), max(1, min(RESAMPLES, AT_ONCE // seeds))
-    weights = rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=draws).T / seeds
+    rng = np.random.default_rng(0)
+    draws = max(1, min(RESAMPLES, AT_ONCE // n_seeds))
+    # How often each seed is drawn, as a weight: a resampled mean is a product.
+    equal = np.full(n_seeds, 1 / n_seeds)
+    weights = rng.multinomial(n_seeds, equal, size=draws).T / n_seeds
+    # An infinite cost stays one in every draw, where 0·∞ would be no number.
     finite = np.isfinite(terms).all(axis=1)
-    values = np.full((runs, draws), np.inf)
+    values = np.full((n_runs, draws), np.inf)
     values[finite] = terms[finite] @ weights / (below @ weights)
-    rows = rng.integers(runs, size=(runs, draws))
-    middle = np.median(np.take_along_axis(values, rows, axis=0), axis=0)
-    low, high = np.quantile(middle, (0.5 - LEVEL / 2, 0.5 + LEVEL / 2), method="nearest")
+    rows = rng.integers(n_runs, size=(n_runs, draws))
+    medians = np.median(np.take_along_axis(values, rows, axis=0), axis=0)
+    quantiles = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
+    low, high = np.quantile(medians, quantiles, method="nearest")
     return float(low), float(high)

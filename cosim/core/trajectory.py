@@ -6,7 +6,6 @@ import csv
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -29,16 +28,20 @@ Derived = Callable[[Scenario, Mapping[str, Array]], Array]
 
 @dataclass(frozen=True)
 class SignalKind:
-    """A declared signal: its `name`, the function `of` other signals that it is, its `unit`.
+    """A declared signal.
 
-    What the loop measures is no such function. A `vector` has a signal for each variable that the
-    scenario's plant names under `name`, in the variable's unit. `group` is where a recording shows
-    it, None: nowhere; `whole` marks 0 or 1, `clock` wall-clock times, which the trajectory's file
-    leaves out.
+    Attributes:
+        name: its name; of a vector, the field of the scenario's plant that names its variables.
+        derive: computes it from other signals; None: the loop measures it.
+        unit: of a signal that is no vector; each variable of a vector has its own.
+        group: where a recording shows it; None: nowhere.
+        vector: whether it has a signal for each variable.
+        whole: whether it is 0 or 1.
+        clock: whether it is a wall-clock time, which the trajectory's file leaves out.
     """
 
     name: str
-    of: Derived | None = None
+    derive: Derived | None = None
     unit: str = ""
     group: Group | None = "unseen"
     vector: bool = False
@@ -50,7 +53,12 @@ class SignalKind:
         return getattr(scenario.plant, self.name) if self.vector else (self.name,)
 
     def units(self, scenario: Scenario, known: Mapping[str, str]) -> dict[str, str]:
-        """Unit of each by name; `known` maps FMU variables to theirs, one not known has none."""
+        """Unit of each signal by name.
+
+        Args:
+            scenario: names the variables.
+            known: units of FMU variables; one that is not known has none.
+        """
         if self.vector:
             return {name: known.get(name, "") for name in self.names(scenario)}
         cost = known.get(scenario.plant.stage_cost, "")
@@ -89,14 +97,15 @@ def clocked() -> frozenset[str]:
 
 
 STATUS = "status"
-PART = 10_000
+ROWS_AT_ONCE = 10_000
+"""Rows that are converted to text at a time."""
 QUANTILES = {"median_us": 0.5, "p95_us": 0.95, "p99_us": 0.99, "max_us": 1.0}
 FALLBACK = "fallback"
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A sampled quantity: its name, its unit ("" if it has none) and `values`, one per sample."""
+    """A sampled quantity: its name, its unit ("" if it has none) and its values, (K,)."""
 
     name: str
     unit: str
@@ -148,10 +157,15 @@ class Trajectory(Result):
     controller: str = ""
 
     def __post_init__(self) -> None:
-        kinds = [kind for kind in SIGNALS if not kind.clock]
-        expected = (name for kind in kinds for name in kind.names(self.scenario))
-        if missing := [name for name in expected if name not in self.signals]:
+        missing = []
+        for kind in SIGNALS:
+            # Times that a clock measured lie in `timing`.
+            if not kind.clock:
+                names = kind.names(self.scenario)
+                missing += [name for name in names if name not in self.signals]
+        if missing:
             raise TrajectoryError(f"the trajectory lacks the signal {', '.join(missing)}")
+        # All are of one length: a figure or a mean would else pair unlike samples.
         samples = len(self.status)
         for signal in self.signals.values():
             if signal.values.shape != (samples,):
@@ -168,15 +182,18 @@ class Trajectory(Result):
         return self.signals[name].values
 
     def _columns(self, names: Sequence[str]) -> Array:
-        return (
-            np.stack([self[name] for name in names], axis=1) if names else np.empty((len(self), 0))
-        )
+        table = np.empty((len(self), len(names)))
+        for column, name in enumerate(names):
+            table[:, column] = self[name]
+        return table
 
     def _facts(self) -> dict[str, object]:
-        found = self.summary()
-        names = ("samples", "J", "economic_cost", "violating_share", "failures")
-        about = {"scenario": self.scenario.name, "controller": self.controller, "seed": self.seed}
-        return about | {name: found[name] for name in names}
+        summary = self.summary()
+        facts: dict[str, object]
+        facts = {"scenario": self.scenario.name, "controller": self.controller, "seed": self.seed}
+        for name in ("samples", "J", "economic_cost", "violating_share", "failures"):
+            facts[name] = summary[name]
+        return facts
 
     def to_pandas(self) -> Any:
         """The signals as a pandas data frame, a row for each sample, a column for each signal."""
@@ -218,8 +235,9 @@ class Trajectory(Result):
         `cosim.core.scenario.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does
         not count; `J` mean of ℓ + penalty, to which every violation counts.
         """
-        names = ("stage_cost", "penalty", "violation")
-        cost, penalty, violation = (self[name][burn_in:] for name in names)
+        cost = self["stage_cost"][burn_in:]
+        penalty = self["penalty"][burn_in:]
+        violation = self["violation"][burn_in:]
         return {
             "economic_cost": float(np.mean(cost)),
             "mean_violation": float(np.mean(violation)),
@@ -242,10 +260,11 @@ class Trajectory(Result):
 
     def timing_summary(self) -> dict[str, dict[str, float]]:
         """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
+        shares = list(QUANTILES.values())
         summary = {}
-        for name, seconds in self.timing.items():
-            quantiles = 1e6 * np.quantile(seconds, list(QUANTILES.values()))
-            summary[name] = dict(zip(QUANTILES, quantiles.tolist(), strict=True))
+        for phase, seconds in self.timing.items():
+            quantiles = 1e6 * np.quantile(seconds, shares)
+            summary[phase] = dict(zip(QUANTILES, quantiles.tolist(), strict=True))
         return summary
 
     def to_csv(self) -> str:
@@ -257,68 +276,108 @@ class Trajectory(Result):
         return _write(path, *self._table())
 
     def write_timing_csv(self, path: str | Path) -> Path:
-        """Write the wall-clock times in µs to a file of their own, one row per sample."""
+        """Write the wall-clock times in µs to a file, apart from what must repeat to the bit."""
         header = [f"{name} [us]" for name in self.timing]
-        rows = ([f"{1e6 * v:.3f}" for v in row] for row in _rows(list(self.timing.values())))
-        return _write(path, header, rows)
+        rows = _rows(list(self.timing.values()))
+        texts = ([f"{1e6 * value:.3f}" for value in row] for row in rows)
+        return _write(path, header, texts)
 
     def _table(self) -> tuple[list[str], Iterator[list[str]]]:
         """Header and rows of the CSV."""
-        signals = list(self.signals.values())
+        header = []
+        for signal in self.signals.values():
+            header.append(f"{signal.name} [{signal.unit}]" if signal.unit else signal.name)
+        return [*header, STATUS], self._texts()
+
+    def _texts(self) -> Iterator[list[str]]:
+        """Rows of the CSV: each signal's value to the bit, and the status."""
         counted = {kind.name for kind in SIGNALS if kind.whole}
-        text = [(lambda v: repr(int(v))) if s.name in counted else repr for s in signals]
-        numbers = _rows([signal.values for signal in signals])
-        titles = [f"{s.name} [{s.unit}]" if s.unit else s.name for s in signals]
-        return [*titles, STATUS], (
-            [*(write(v) for write, v in zip(text, row, strict=True)), status]
-            for row, status in zip(numbers, self.status, strict=True)
-        )
+        is_whole = [name in counted for name in self.signals]
+        numbers = _rows([signal.values for signal in self.signals.values()])
+        for row, status in zip(numbers, self.status, strict=True):
+            cells = []
+            for value, whole in zip(row, is_whole, strict=True):
+                cells.append(repr(int(value)) if whole else repr(value))
+            yield [*cells, status]
 
 
-def _write(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Path:
+def _write(
+    path: str | Path,
+    header: Sequence[str],
+    rows: Iterable[Sequence[str]],
+) -> Path:
     with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
-        csv.writer(stream, lineterminator="\n").writerows(chain([header], rows))
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
     return Path(path)
 
 
 def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:
-    """Rows of equally long columns, converted a part at a time to save memory."""
-    for first in range(0, len(columns[0]) if columns else 0, PART):
-        yield from zip(*(column[first : first + PART].tolist() for column in columns), strict=True)
+    """Rows of equally long columns."""
+    n_rows = len(columns[0]) if columns else 0
+    # A part at a time: a number of Python's takes four times the memory of NumPy's.
+    for first in range(0, n_rows, ROWS_AT_ONCE):
+        end = first + ROWS_AT_ONCE
+        yield from zip(*(column[first:end].tolist() for column in columns), strict=True)
 
 
 def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:
-    """Read what `Trajectory.write_csv` wrote; raises TrajectoryError with file and line."""
-    return Trajectory(scenario, *read_signals(path))
+    """Read what `Trajectory.write_csv` wrote.
+
+    Args:
+        path: the file.
+        scenario: on which it was run.
+
+    Raises:
+        TrajectoryError: with file and line.
+    """
+    signals, status = read_signals(path)
+    return Trajectory(scenario, signals, status)
 
 
 def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
-    """Read the signals by name and the status of each sample from a trajectory's CSV file.
+    """Read a trajectory's CSV file.
 
-    Raises TrajectoryError with file and line.
+    Returns:
+        The signals by name, and the status of each sample.
+
+    Raises:
+        TrajectoryError: with file and line.
     """
     try:
         with Path(path).open(newline="", encoding="utf-8") as stream:
             rows = list(csv.reader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
         raise TrajectoryError(f"'{path}' cannot be read: {cause}") from None
+    # Another table, or a file that was cut after its header.
     if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
-    header, body = rows[0], rows[1:]
+    header = rows[0]
+    body = rows[1:]
     values = np.empty((len(body), len(header) - 1))
-    for number, row in enumerate(body, start=2):
+    # The header is line 1.
+    for line, row in enumerate(body, start=2):
         if len(row) != len(header):
-            raise TrajectoryError(f"'{path}', line {number}: {len(row)} fields, not {len(header)}")
+            raise TrajectoryError(f"'{path}', line {line}: {len(row)} fields, not {len(header)}")
         try:
-            if not (text := "".join(row[:-1])).isascii() or "_" in text:
-                raise ValueError("a number has other signs than those of ASCII, or '_'")
-            values[number - 2] = [float(cell) for cell in row[:-1]]
+            values[line - 2] = _numbers_of_row(row[:-1])
         except ValueError as error:
-            raise TrajectoryError(f"'{path}', line {number}: {error}") from None
-    signals = {}
+            raise TrajectoryError(f"'{path}', line {line}: {error}") from None
+    signals: dict[str, Signal] = {}
     for title, column in zip(header, values.T, strict=False):
         name, _, unit = title.partition(" [")
+        # The later one would replace the first without a word.
         if name in signals:
             raise TrajectoryError(f"'{path}' has two columns '{name}'")
         signals[name] = Signal(name, unit.removesuffix("]"), column.copy())
     return signals, [row[-1] for row in body]
+
+
+def _numbers_of_row(cells: Sequence[str]) -> list[float]:
+    """Numbers of a row; raises ValueError where a cell is none."""
+    # Python's float takes digits of any script, and underscores.
+    text = "".join(cells)
+    if not text.isascii() or "_" in text:
+        raise ValueError("a number has other signs than those of ASCII, or '_'")
+    return [float(cell) for cell in cells]

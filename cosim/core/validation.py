@@ -12,9 +12,12 @@ from pydantic import BaseModel, BeforeValidator, ValidationError
 Document = TypeVar("Document", bound=BaseModel)
 
 # In place of pydantic's messages, whose words are not TOML's.
-_EXPECTED = {"tuple_type": "must be a list"} | dict.fromkeys(
-    ("dict_type", "model_type", "model_attributes_type"), "must be a table"
-)
+_EXPECTED = {
+    "tuple_type": "must be a list",
+    "dict_type": "must be a table",
+    "model_type": "must be a table",
+    "model_attributes_type": "must be a table",
+}
 
 
 def _no_boolean(value: object) -> object:
@@ -28,9 +31,22 @@ SchemaVersion = Annotated[Literal[1], BeforeValidator(_no_boolean)]
 
 
 def validated(
-    model: type[Document], document: Any, origin: str, error: type[Exception]
+    model: type[Document],
+    document: Any,
+    origin: str,
+    error: type[Exception],
 ) -> Document:
-    """The document as a model; raises `error` that names its origin, field and allowed values."""
+    """The document as a model.
+
+    Args:
+        model: class of the document.
+        document: what is validated.
+        origin: what messages call it.
+        error: class of the exception that is raised.
+
+    Raises:
+        error: in one line that names origin, field and allowed values.
+    """
     try:
         return model.model_validate(document)
     except ValidationError as cause:
@@ -39,8 +55,23 @@ def validated(
         raise error(f"{origin}: {_complaint(dict(first), model)}{more}") from None
 
 
-def whole_number(name: str, value: Any, least: int, error: type[Exception]) -> int:
-    """An argument as an integer, NumPy's too; raises `error` on another kind or a smaller one."""
+def whole_number(
+    name: str,
+    value: Any,
+    least: int,
+    error: type[Exception],
+) -> int:
+    """An argument as an integer, NumPy's too.
+
+    Args:
+        name: of the argument, for messages.
+        value: what was given.
+        least: smallest value that is allowed.
+        error: class of the exception that is raised.
+
+    Raises:
+        error: it is no whole number, or a smaller one.
+    """
     try:
         number = index(value)
     except TypeError:
@@ -51,22 +82,34 @@ def whole_number(name: str, value: Any, least: int, error: type[Exception]) -> i
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """` (did you mean 'x'?)` if a known word is close, else nothing."""
+    """` (did you mean 'x'?)` if a known word is close, else nothing.
+
+    Args:
+        word: what was given.
+        known: words that are allowed.
+    """
     close = get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f" (did you mean '{close[0]}'?)" if close else ""
 
 
 def instead(word: str, known: Iterable[str]) -> str:
-    """Text with the words that are known in place of an unknown one, the closest first."""
+    """Text with the words that are known in place of an unknown one, the closest first.
+
+    Args:
+        word: what was given.
+        known: words that are allowed.
+    """
     known = list(known)
     return f"{suggestion(word, known)}; there are {', '.join(known)}"
 
 
 def _complaint(detail: dict[str, Any], model: type[BaseModel]) -> str:
-    kind, given = detail["type"], detail["input"]
+    """One line of pydantic's detail of a fault."""
+    kind = detail["type"]
     if kind == "value_error":
         return str(detail["ctx"]["error"])
-    path = [part for part in detail["loc"] if part not in ("float", "bool")]  # of a union
+    # A union adds the kind that was tried.
+    path = [part for part in detail["loc"] if part not in ("float", "bool")]
     field = _dotted(path)
     if kind == "missing":
         return f"{field}: is missing"
@@ -77,8 +120,10 @@ def _complaint(detail: dict[str, Any], model: type[BaseModel]) -> str:
             f"allowed are {', '.join(known)}"
         )
     expected = _EXPECTED.get(kind) or str(detail["msg"]).replace("Input should be", "must be", 1)
-    shown = repr(given)
-    return f"{field}: {expected}, not {shown if len(shown) <= 60 else shown[:57] + '...'}"
+    shown = repr(detail["input"])
+    if len(shown) > 60:
+        shown = f"{shown[:57]}..."
+    return f"{field}: {expected}, not {shown}"
 
 
 def _dotted(path: list[Any]) -> str:
@@ -86,21 +131,28 @@ def _dotted(path: list[Any]) -> str:
     for part in path:
         # A key may be any text; a message is one line.
         name = part if str(part).isprintable() else repr(part)
-        text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else str(name)
+        if isinstance(part, int):
+            text += f"[{part}]"
+        elif text:
+            text += f".{name}"
+        else:
+            text = str(name)
     return text or "document"
 
 
 def _fields(model: type[BaseModel], path: list[Any]) -> list[str]:
     """Names that the table at `path` allows."""
     for part in path:
-        if isinstance(part, int):  # an entry of a list of tables
+        # An entry of a list of tables.
+        if isinstance(part, int):
             continue
         annotation = model.model_fields[str(part)].annotation
-        inner = get_args(annotation)
-        candidates = (annotation, *inner, *(deeper for each in inner for deeper in get_args(each)))
-        model = next(
-            option
-            for option in candidates
-            if isinstance(option, type) and issubclass(option, BaseModel)
-        )
+        # The table itself, in a union with None, or in a list of such a union.
+        candidates = [annotation]
+        for inner in get_args(annotation):
+            candidates += [inner, *get_args(inner)]
+        for candidate in candidates:
+            if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+                model = candidate
+                break
     return [info.alias or name for name, info in model.model_fields.items()]

@@ -22,7 +22,7 @@ from fmus.check import information, problems_of
 
 SAMPLES = 20
 """Steps of the run with the start values held."""
-SHOWN = 5
+NAMES_SHOWN = 5
 """Names of a row at most."""
 
 
@@ -30,9 +30,13 @@ SHOWN = 5
 class PlantCheck:
     """What `check_plant` found.
 
-    `usable` and `verdict` say whether the FMU can be a plant, `rows` what was looked at, what was
-    seen and what follows. `remarks` are what the model description has against FMI's rules, which
-    bears on other tools. `report` is the probe's, None where the FMU cannot be tried at all.
+    Attributes:
+        fmu: the file.
+        usable: whether the FMU can be a plant.
+        verdict: the same in words.
+        rows: what was looked at, what was seen and what follows.
+        remarks: what the model description has against FMI's rules, which bears on other tools.
+        report: the probe's; None where the FMU cannot be tried at all.
     """
 
     fmu: Path
@@ -92,6 +96,7 @@ def check_plant(
     """
     path = (fmus.path(str(fmu)) if str(fmu) in SHIPPED else Path(fmu)).absolute()
     _require_fmu(path)
+    # From here on an FMU that cannot be a plant is an answer, and no error.
     try:
         archive = unpack(path)
     except PlantError as error:
@@ -99,19 +104,24 @@ def check_plant(
     about = information(path, archive.description)
     remarks = tuple(problems_of(archive.folder))
     rows = [_interfaces(about), _platforms(about), _description(remarks)]
-    if reasons := list(refusals(archive)):
-        return PlantCheck(
-            path, False, f"it cannot be a plant: {'; '.join(reasons)}", tuple(rows), remarks
-        )
+
+    def refused(reason: str) -> PlantCheck:
+        return PlantCheck(path, False, f"it cannot be a plant: {reason}", tuple(rows), remarks)
+
+    reasons = list(refusals(archive))
+    if reasons:
+        return refused("; ".join(reasons))
     document, roles = _document(path, archive, states, actions, stage_cost, sampling_time)
-    rows += [roles, _step_size(archive, document["sampling_time"])]
+    rows.append(roles)
+    rows.append(_step_size(archive, document["sampling_time"]))
     try:
         scenario = Scenario.from_dict(document)
         report = probe(scenario)
-        rows += _probed(report)
-        rows += [_starts(scenario, archive), _run(scenario)]
+        rows += _probe_rows(report)
+        rows.append(_starts_row(scenario, archive))
+        rows.append(_run_row(scenario))
     except CosimError as error:
-        return PlantCheck(path, False, f"it cannot be a plant: {error}", tuple(rows), remarks)
+        return refused(str(error))
     return PlantCheck(path, True, _verdict(report), tuple(rows), remarks, report)
 
 
@@ -135,10 +145,9 @@ def _interfaces(about: dict[str, Any]) -> Row:
 
 
 def _platforms(about: dict[str, Any]) -> Row:
-    words = [
-        f"{folder} ({', '.join(made_for)})" if made_for else folder
-        for folder, made_for in about["platforms"].items()
-    ]
+    words = []
+    for folder, made_for in about["platforms"].items():
+        words.append(f"{folder} ({', '.join(made_for)})" if made_for else folder)
     return Row("platforms", ", ".join(words) or "none", "")
 
 
@@ -162,38 +171,36 @@ def _document(
     Its other real outputs stand as disturbances. Where nobody can guess the roles, all outputs are
     states.
     """
-    known = [name for name in (*states, *actions, stage_cost) if name]
+    consequence = "as `cosim scenario init` would draft them"
     try:
         roles = guess_roles(archive, states, actions, stage_cost)
-        still_to_say = ""
     except PlantError as error:
-        if any(archive.variable(name) is None for name in known):
-            raise
+        # A name that is wrong is the user's to mend; a role that cannot be guessed is not.
+        for name in (*states, *actions, stage_cost):
+            if name and archive.variable(name) is None:
+                raise
         roles = number_roles(archive, states, actions, stage_cost)
-        still_to_say = str(error)
+        consequence = str(error)
     stated = number(getattr(archive.description.defaultExperiment, "stepSize", None), 0.0)
     internal = number(archive.description.coSimulation.fixedInternalStepSize, 0.0)
     step = sampling_time or stated or internal or 1.0
     document = first_document(path, archive, roles, step)
-    others = [
-        name
-        for name, variable in archive.variables.items()
-        if variable.causality == "output" and variable.type in REALS and not variable.shape
-    ]
-    document["plant"]["disturbances"] = [
-        name for name in others if name not in (*roles.states, roles.stage_cost)
-    ]
+    others = []
+    for name, variable in archive.variables.items():
+        is_output = variable.causality == "output" and variable.type in REALS
+        if is_output and not variable.shape and name not in (*roles.states, roles.stage_cost):
+            others.append(name)
+    # So the probe says of every output where it belongs.
+    document["plant"]["disturbances"] = others
     document["plant"]["mapping"] = {}
     document["disturbance"] = {"law": "none"}
     words = f"states {_some(roles.states)}; actions {_some(roles.actions)}; cost {roles.stage_cost}"
-    return document, Row(
-        "roles", words, still_to_say or "as `cosim scenario init` would draft them"
-    )
+    return document, Row("roles", words, consequence)
 
 
 def _some(names: Sequence[str]) -> str:
-    more = f" … ({len(names)} in all)" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+    more = f" … ({len(names)} in all)" if len(names) > NAMES_SHOWN else ""
+    return ", ".join(names[:NAMES_SHOWN]) + more
 
 
 def _step_size(archive: UnpackedFmu, step: float) -> Row:
@@ -210,19 +217,23 @@ def _step_size(archive: UnpackedFmu, step: float) -> Row:
     return Row("step size", ", ".join(words), follows)
 
 
-def _probed(report: Report) -> list[Row]:
+def _probe_rows(report: Report) -> list[Row]:
     """The probe's rows; that of the outputs with their names by kind, its start state left out."""
     by_kind: dict[str, list[str]] = {}
     for name, kind in report.kinds.items():
         by_kind.setdefault(kind.value, []).append(name)
-    said = "; ".join(f"{_some(names)}: {words}" for words, names in by_kind.items())
-    rows = [row for row in report.rows if row.subject != "start state"]
-    return [
-        Row(row.subject, said, row.consequence) if row.subject == "outputs" else row for row in rows
-    ]
+    kinds = "; ".join(f"{_some(names)}: {words}" for words, names in by_kind.items())
+    rows = []
+    for row in report.rows:
+        if row.subject == "outputs":
+            rows.append(Row(row.subject, kinds, row.consequence))
+        # What sets the start is looked for here.
+        elif row.subject != "start state":
+            rows.append(row)
+    return rows
 
 
-def _starts(scenario: Scenario, archive: UnpackedFmu) -> Row:
+def _starts_row(scenario: Scenario, archive: UnpackedFmu) -> Row:
     parameters = start_parameters(scenario, archive)
     missing = [name for name in scenario.plant.states if name not in parameters]
     words = [f"{name} by {parameter}" for name, parameter in parameters.items()]
@@ -232,14 +243,14 @@ def _starts(scenario: Scenario, archive: UnpackedFmu) -> Row:
     return Row("start state", _some(words), follows)
 
 
-def _run(scenario: Scenario) -> Row:
+def _run_row(scenario: Scenario) -> Row:
     """Steps with the start values held; raises PlantError where the FMU fails."""
     with FmuPlant(scenario) as plant:
         plant.reset(0)
         action = scenario.saturate(scenario.reference_action)
         for _ in range(SAMPLES):
             state = plant.step(action).s
-    shown = ", ".join(f"{value:.4g}" for value in state[:SHOWN])
+    shown = ", ".join(f"{value:.4g}" for value in state[:NAMES_SHOWN])
     return Row("run", f"{SAMPLES} steps, all numbers finite", f"then the states are {shown}")
 
 

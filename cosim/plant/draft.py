@@ -21,7 +21,7 @@ from cosim.core.scenario import Scenario
 from cosim.core.validation import suggestion
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.probe import AFTER, Kind, Report, Restart, probe
+from cosim.plant.probe import AFTER, OutputKind, Report, Restart, probe
 from cosim.plant.starts import candidates, start_parameters
 from cosim.plant.wiring import INTEGERS, NO_NUMBERS, REALS, refusals
 
@@ -33,13 +33,18 @@ HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
 COSTS = ("cost", "loss", "objective")
-SHOWN = 12
+INPUTS_SHOWN = 12
 """Inputs that a remark names at most."""
 
 
 @dataclass(frozen=True)
 class Roles:
-    """Which variables of an FMU play which role in a scenario, by name."""
+    """Which variables of an FMU play which role in a scenario, by name.
+
+    Attributes:
+        states, actions, disturbances: of the plant.
+        stage_cost: an output.
+    """
 
     states: tuple[str, ...]
     actions: tuple[str, ...]
@@ -67,11 +72,15 @@ def guess_roles(
     Raises:
         PlantError: A name is unknown, or a role cannot be guessed; it says what to give.
     """
-    for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
+    named = [*states, *actions]
+    if stage_cost:
+        named.append(stage_cost)
+    for name in named:
         if fmu.variable(name) is None:
             raise PlantError(
                 f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}"
             )
+    # As our own plants name them.
     noise = [name for name in _reals(fmu, "output") if f"{name}_nominal" in fmu.variables]
     cost = stage_cost or _cost(fmu)
     return Roles(
@@ -98,25 +107,34 @@ def number_roles(
             first output.
     """
 
-    def names(causality: str, variability: str = "") -> tuple[str, ...]:
-        return tuple(
-            elements(variable)[0]
-            for variable in fmu.variables.values()
-            if variable.causality == causality
-            and variable.variability in (variability or variable.variability,)
-            and variable.type not in NO_NUMBERS
-        )
-
-    outputs = names("output") or names("local")
+    outputs = _number_names(fmu, "output") or _number_names(fmu, "local")
     costs = [name for name in outputs if _is_cost(name)]
     cost = stage_cost or (costs[0] if costs else outputs[0])
     others = tuple(name for name in outputs if name != cost)
+    inputs = _number_names(fmu, "input")
+    # One suffices to try the FMU.
+    tunable = _number_names(fmu, "parameter", "tunable")[:1]
     return Roles(
         states=tuple(states) or others or outputs,
-        actions=tuple(actions) or names("input") or names("parameter", "tunable")[:1],
+        actions=tuple(actions) or inputs or tunable,
         disturbances=(),
         stage_cost=cost,
     )
+
+
+def _number_names(
+    fmu: UnpackedFmu,
+    causality: str,
+    variability: str = "",
+) -> tuple[str, ...]:
+    """Names of the numbers of a causality, and of a variability if it is given."""
+    names = []
+    for variable in fmu.variables.values():
+        if variable.causality != causality or variable.type in NO_NUMBERS:
+            continue
+        if not variability or variable.variability == variability:
+            names.append(elements(variable)[0])
+    return tuple(names)
 
 
 def draft_scenario(
@@ -155,6 +173,7 @@ def draft_scenario(
     document = first_document(fmu, archive, roles, sampling_time, action)
     document, remarks = _with_what_was_seen(document, archive)
     document, more_remarks = _with_starts(document, archive, state)
+    # Of all start values, those of a steady state: a controller begins there.
     undisturbed = document | {"disturbance": {"law": "none"}}
     with FmuPlant(Scenario.from_dict(undisturbed)) as plant:
         x, u, cost = nearest_steady_state(
@@ -163,6 +182,7 @@ def draft_scenario(
             np.array(document["controller"]["reference_action"]),
         )
         units = plant.units
+    # A violation of one unit costs some ten times what a sample does, to a power of ten.
     weight = 10.0 ** ceil(log10(10 * max(abs(cost), 1.0)) - 0.5)
     document["penalty"]["linear"] = [weight] * len(x)
     document["plant"]["initial_state"] = x.tolist()
@@ -170,7 +190,8 @@ def draft_scenario(
     if str(fmu) in SHIPPED:
         document["controller"]["model"] = f"controllers.{str(fmu).removesuffix('_fmi3')}:model"
     else:
-        with suppress(ValueError):  # it is on another drive
+        # A file on another drive keeps its absolute path.
+        with suppress(ValueError):
             path = os.path.relpath(archive.path, target.resolve().parent)
             document["plant"]["fmu"] = Path(path).as_posix()
     remarks = _remarks(document, archive, units) | remarks | more_remarks
@@ -187,28 +208,37 @@ def first_document(
     """A scenario's document with the FMU's start values, before any of its code has run.
 
     No start is mapped; the states' initial values are zero.
+
+    Args:
+        fmu: a shipped FMU's name, or a path.
+        archive: its content.
+        roles: of its variables.
+        sampling_time: in s; without it the FMU's own step size.
+        action: in place of the FMU's start values, (m,).
     """
     mapping = _mapping(archive, roles.disturbances)
     n = len(roles.states)
-    u = _starts(archive, roles.actions, action, "action")
-    limits = [
-        action_limits(archive, name, value)
-        for name, value in zip(roles.actions, u.tolist(), strict=True)
-    ]
-    ranges = [archive.range(name) for name in roles.states]
+    u = _start_vector(archive, roles.actions, action, "action")
+    action_ranges = []
+    for name, value in zip(roles.actions, u.tolist(), strict=True):
+        action_ranges.append(action_limits(archive, name, value))
+    action_lower, action_upper = zip(*action_ranges, strict=True)
+    state_ranges = [archive.range(name) for name in roles.states]
+    state_lower, state_upper = zip(*state_ranges, strict=True)
     disturbance: dict[str, Any] = {"law": "none"}
     if "nominal" in mapping and "ranges" in mapping:
         disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
         for field in ("nominal", "ranges"):
             disturbance[field] = [start_value(archive, name) for name in mapping[field]]
+    is_shipped = str(fmu) in SHIPPED
     return {
         "schema": 1,
-        "name": archive.path.stem if str(fmu) not in SHIPPED else str(fmu),
+        "name": str(fmu) if is_shipped else archive.path.stem,
         "description": str(archive.description.description or archive.description.modelName),
         "sampling_time": sampling_time or _sampling_time(archive, mapping),
         "discount": 0.99,
         "plant": {
-            "fmu": str(fmu) if str(fmu) in SHIPPED else archive.path.as_posix(),
+            "fmu": str(fmu) if is_shipped else archive.path.as_posix(),
             "states": list(roles.states),
             "actions": list(roles.actions),
             "disturbances": list(roles.disturbances),
@@ -218,10 +248,10 @@ def first_document(
         },
         "disturbance": disturbance,
         "bounds": {
-            "state_lower": [low for low, _ in ranges],
-            "state_upper": [high for _, high in ranges],
-            "action_lower": [low for low, _ in limits],
-            "action_upper": [high for _, high in limits],
+            "state_lower": list(state_lower),
+            "state_upper": list(state_upper),
+            "action_lower": list(action_lower),
+            "action_upper": list(action_upper),
         },
         "penalty": {"linear": [1.0] * n, "quadratic": [1.0] * n},
         "controller": _reference(np.zeros(n), u, 0.0),
@@ -236,10 +266,12 @@ def _with_what_was_seen(
     Only what differs from a scenario's defaults is written: outputs that doStep computes, the
     start time and tolerance that the file states, a stop time without which it does not run.
     """
-    quiet = document | {"disturbance": {"law": "none"}}
-    report = probe(Scenario.from_dict(quiet))
-    plant, remarks = dict(document["plant"]), {}
-    mapping = plant.pop("mapping")  # it stands last
+    undisturbed = document | {"disturbance": {"law": "none"}}
+    report = probe(Scenario.from_dict(undisturbed))
+    plant = dict(document["plant"])
+    remarks: dict[str, str] = {}
+    # It stands last, as a table of its own.
+    mapping = plant.pop("mapping")
     if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
         plant["outputs"] = report.outputs
         remarks["plant.outputs"] = _outputs_remark(report)
@@ -255,30 +287,39 @@ def _with_what_was_seen(
     if experiment.tolerance is not None:
         plant["tolerance"] = experiment.tolerance
         remarks["plant.tolerance"] = "relative, of the FMU's solver; the FMU's own"
-    switches = [name for name in report.undriven if archive.variables[name].type == "Boolean"]
     if report.still:
-        nothing = [name for name, moves_output in report.still.items() if not moves_output]
-        alone = f", no output either by {', '.join(nothing)}," if nothing else ""
-        enable = f" such as {', '.join(switches)}" if switches else ""
-        remarks["plant.actions"] = (
-            f"CHECK: no state moves by {', '.join(report.still)}{alone} as things are; an input"
-            f"{enable} may have to be set by plant.parameters first"
-        )
+        remarks["plant.actions"] = _actions_remark(report, archive)
     if report.undriven:
-        pairs = [f"{name} = {start or '?'}" for name, start in report.undriven.items()]
-        more = f" and {len(pairs) - SHOWN} more" if len(pairs) > SHOWN else ""
-        inputs = ", ".join(pairs[:SHOWN]) + more
-        remarks["plant.parameters"] = (
-            f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
-        )
+        remarks["plant.parameters"] = _inputs_remark(report)
     if report.restart is not Restart.RESET:
         remarks["plant.fmu"] = f"each episode: {report.restart.value}, since no reset was proven"
-    return document | {"plant": plant | {"mapping": mapping}}, remarks
+    plant["mapping"] = mapping
+    return document | {"plant": plant}, remarks
+
+
+def _actions_remark(report: Report, archive: UnpackedFmu) -> str:
+    """Which actions move no state, and what may be why."""
+    nothing = [name for name, moves_output in report.still.items() if not moves_output]
+    alone = f", no output either by {', '.join(nothing)}," if nothing else ""
+    switches = [name for name in report.undriven if archive.variables[name].type == "Boolean"]
+    enable = f" such as {', '.join(switches)}" if switches else ""
+    return (
+        f"CHECK: no state moves by {', '.join(report.still)}{alone} as things are; an input"
+        f"{enable} may have to be set by plant.parameters first"
+    )
+
+
+def _inputs_remark(report: Report) -> str:
+    """Which inputs nobody drives."""
+    pairs = [f"{name} = {start or '?'}" for name, start in report.undriven.items()]
+    more = f" and {len(pairs) - INPUTS_SHOWN} more" if len(pairs) > INPUTS_SHOWN else ""
+    inputs = ", ".join(pairs[:INPUTS_SHOWN]) + more
+    return f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
 
 
 def _outputs_remark(report: Report) -> str:
     """What is known of the outputs that doStep computes."""
-    ends = [name for name, kind in report.kinds.items() if kind is Kind.END]
+    ends = [name for name, kind in report.kinds.items() if kind is OutputKind.END]
     if not ends:
         return "doStep computes the outputs: they are read after it"
     return (
@@ -288,7 +329,9 @@ def _outputs_remark(report: Report) -> str:
 
 
 def _with_starts(
-    document: dict[str, Any], archive: UnpackedFmu, state: Sequence[float]
+    document: dict[str, Any],
+    archive: UnpackedFmu,
+    state: Sequence[float],
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The document with the parameters that set the states' starts, and remarks on them."""
     states = document["plant"]["states"]
@@ -296,31 +339,44 @@ def _with_starts(
     missing = [name for name in states if name not in parameters]
     remarks = {}
     if missing and parameters:
+        pairs = [f"{parameter} for {name}" for name, parameter in parameters.items()]
         remarks["plant.mapping"] = (
             f"CHECK: no start was found for {', '.join(missing)}, so that an episode starts where "
-            "the FMU does; what was found may go into plant.parameters: "
-            + ", ".join(f"{parameter} for {name}" for name, parameter in parameters.items())
+            f"the FMU does; what was found may go into plant.parameters: {', '.join(pairs)}"
         )
     starts = [parameters.get(name, name) for name in states]
-    plant = document["plant"] | {"initial_state": _starts(archive, starts, state, "state").tolist()}
+    plant = dict(document["plant"])
+    plant["initial_state"] = _start_vector(archive, starts, state, "state").tolist()
+    # The starts of some states alone are of no use: an episode begins at all of them.
     if not missing:
         plant["mapping"] = {"initial_state": starts} | plant["mapping"]
     return document | {"plant": plant}, remarks
 
 
-def _reference(x: Array, u: Array, cost: float) -> dict[str, Any]:
+def _reference(
+    x: Array,
+    u: Array,
+    cost: float,
+) -> dict[str, Any]:
     return {
-        "reference_state": x.tolist(), "reference_action": u.tolist(), "reference_cost": cost,
-    }  # fmt: skip
+        "reference_state": x.tolist(),
+        "reference_action": u.tolist(),
+        "reference_cost": cost,
+    }
 
 
-def _starts(fmu: UnpackedFmu, names: Sequence[str], given: Sequence[float], kind: str) -> Array:
-    """Start values that were given, else the FMU's."""
-    if given and len(given) != len(names):
+def _start_vector(
+    fmu: UnpackedFmu,
+    names: Sequence[str],
+    values: Sequence[float],
+    option: str,
+) -> Array:
+    """The values of an option, else the FMU's start values."""
+    if values and len(values) != len(names):
         raise PlantError(
-            f"--{kind} takes {len(names)} numbers ({', '.join(names)}), not {len(given)}"
+            f"--{option} takes {len(names)} numbers ({', '.join(names)}), not {len(values)}"
         )
-    return np.array(given or [start_value(fmu, name) for name in names], dtype=float)
+    return np.array(values or [start_value(fmu, name) for name in names], dtype=float)
 
 
 def start_value(fmu: UnpackedFmu, name: str) -> float:
@@ -329,21 +385,35 @@ def start_value(fmu: UnpackedFmu, name: str) -> float:
     stated = str(getattr(variable, "start", None) or "").split()
     if variable is None or not stated:
         return 0.0
-    if variable.shape and len(stated) > 1:
-        index = [int(i) for i in name[len(variable.name) + 1 : -1].split(",")]
-        return number(stated[int(np.ravel_multi_index(index, variable.shape))], 0.0)
-    return number(stated[0], 0.0)
+    if not variable.shape or len(stated) == 1:
+        return number(stated[0], 0.0)
+    # The elements stand row by row.
+    brackets = name[len(variable.name) + 1 : -1]
+    index = [int(i) for i in brackets.split(",")]
+    element = int(np.ravel_multi_index(index, variable.shape))
+    return number(stated[element], 0.0)
 
 
-def action_limits(fmu: UnpackedFmu, name: str, value: float) -> tuple[float, float]:
+def action_limits(
+    fmu: UnpackedFmu,
+    name: str,
+    value: float,
+) -> tuple[float, float]:
     """Range of an action: the FMU's, and where it states none, `value` ± its magnitude.
 
     A bound that is no bound (`UnpackedFmu.range`) counts as not stated.
+
+    Args:
+        fmu: states the range.
+        name: of the action.
+        value: its start value.
     """
     low, high = fmu.range(name)
     centre = min(max(value, low), high)
     reach = abs(centre) or 1.0
-    return low if isfinite(low) else centre - reach, high if isfinite(high) else centre + reach
+    lower = low if isfinite(low) else centre - reach
+    upper = high if isfinite(high) else centre + reach
+    return lower, upper
 
 
 def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
@@ -355,7 +425,9 @@ def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
 
 
 def _remarks(
-    document: dict[str, Any], fmu: UnpackedFmu, units: Mapping[str, str]
+    document: dict[str, Any],
+    fmu: UnpackedFmu,
+    units: Mapping[str, str],
 ) -> dict[str, str]:
     """Remark on each field and table by its dotted name."""
     plant = document["plant"]
@@ -370,9 +442,10 @@ def _remarks(
         "controller": "the undisturbed plant's steady state nearest to its start values; "
         "`cosim tuning` prints the cheapest one",
     }
-    free = [name for name in plant["states"] if not any(map(isfinite, fmu.range(name)))]
-    if free:
-        remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(free)}"
+    # A state may well have one bound alone; an action is sampled between two.
+    unbounded = [name for name in plant["states"] if not any(map(isfinite, fmu.range(name)))]
+    if unbounded:
+        remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(unbounded)}"
     open_ended = [name for name in plant["actions"] if not all(map(isfinite, fmu.range(name)))]
     if open_ended:
         remarks["bounds.action_lower"] = (
@@ -391,8 +464,11 @@ def _remarks(
 def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
     """TOML text with each remark as a comment above the key or table of its dotted name.
 
-    A remark on a key that the text does not have stands above its table.
+    Args:
+        text: TOML.
+        remarks: by dotted name; one on a key that the text does not have stands above its table.
     """
+    # Dotted name of the key or table of each line.
     names = []
     table = ""
     for line in text.splitlines():
@@ -414,14 +490,16 @@ def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
 
 
 def _reals(fmu: UnpackedFmu, causality: str) -> list[str]:
-    return [
-        name
-        for name, variable in fmu.variables.items()
-        if variable.causality == causality and variable.type in REALS and not variable.shape
-    ]
+    """Names of the scalar reals of a causality."""
+    names = []
+    for name, variable in fmu.variables.items():
+        if variable.causality == causality and variable.type in REALS and not variable.shape:
+            names.append(name)
+    return names
 
 
 def _cost(fmu: UnpackedFmu) -> str:
+    """The one output that is called a cost."""
     outputs = _reals(fmu, "output")
     if not outputs:
         raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output to draft from")
@@ -441,12 +519,16 @@ def _is_cost(name: str) -> bool:
 
 def _states(fmu: UnpackedFmu, others: Sequence[str]) -> list[str]:
     """Continuous states, else outputs with a start parameter."""
-    rates = [v for v in fmu.variables.values() if getattr(v, "derivative", None) is not None]
-    if rates:
-        names = [name for rate in rates for name in elements(rate.derivative)]
-        return list(dict.fromkeys(names))
+    # FMI marks the rate of a continuous state, which names it.
+    continuous = []
+    for variable in fmu.variables.values():
+        if getattr(variable, "derivative", None) is not None:
+            continuous += elements(variable.derivative)
+    if continuous:
+        return list(dict.fromkeys(continuous))
     outputs = [name for name in _reals(fmu, "output") if name not in others]
-    if started := [name for name in outputs if any(candidates(fmu, name))]:
+    started = [name for name in outputs if any(candidates(fmu, name))]
+    if started:
         return started
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no start "
@@ -459,7 +541,11 @@ def elements(variable: Any) -> list[str]:
     if not variable.shape:
         return [str(variable.name)]
     indices = np.ndindex(*variable.shape)
-    return [f"{variable.name}[{','.join(map(str, index))}]" for index in indices]
+    names = []
+    for index in indices:
+        positions = ",".join(map(str, index))
+        names.append(f"{variable.name}[{positions}]")
+    return names
 
 
 def _actions(fmu: UnpackedFmu, noise: Sequence[str]) -> list[str]:
@@ -468,11 +554,9 @@ def _actions(fmu: UnpackedFmu, noise: Sequence[str]) -> list[str]:
     if inputs:
         return inputs
     parameters = _reals(fmu, "parameter")
-    tunable = [n for n in parameters if fmu.variables[n].variability == "tunable"]
-    raise PlantError(
-        f"FMU '{fmu.path.name}' has no real input to act on"
-        + (f"; give --actions A,B,…, of its tunable {', '.join(tunable)}" if tunable else "")
-    )
+    tunable = [name for name in parameters if fmu.variables[name].variability == "tunable"]
+    cure = f"; give --actions A,B,…, of its tunable {', '.join(tunable)}" if tunable else ""
+    raise PlantError(f"FMU '{fmu.path.name}' has no real input to act on{cure}")
 
 
 def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
@@ -488,14 +572,17 @@ def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
     table: dict[str, Any] = {}
     if is_parameter("seed", INTEGERS):
         table["seed"] = [name for name in ("seed", "seedHigh") if is_parameter(name, INTEGERS)]
-    for name, types in (("sampling_time", REALS), ("stochastic", ("Boolean",))):
-        if is_parameter(name, types):
-            table[name] = name
+    if is_parameter("sampling_time", REALS):
+        table["sampling_time"] = "sampling_time"
+    if is_parameter("stochastic", ("Boolean",)):
+        table["stochastic"] = "stochastic"
     declared = getattr(known.get("law"), "declaredType", None)
     items = getattr(declared, "items", None) or []
     codes = {item.name: int(item.value) for item in items if item.name in ("uniform", "normal")}
     if codes and is_parameter("law", ("Enumeration",)):
-        table |= {"law": "law", "law_codes": codes}
+        table["law"] = "law"
+        table["law_codes"] = codes
+    # Means and ranges of all disturbances, or of none: a scenario has an entry for each.
     for field, suffix in (("nominal", "_nominal"), ("ranges", "_range")):
         parameters = [f"{name}{suffix}" for name in noise]
         if parameters and all(is_parameter(name, REALS) for name in parameters):
@@ -510,7 +597,9 @@ LOOSE = 1e-6
 
 
 def nearest_steady_state(
-    plant: FmuPlant, state: Array, action: Array
+    plant: FmuPlant,
+    state: Array,
+    action: Array,
 ) -> tuple[Array, Array, float]:
     """Steady state x = Φ(x, u) of the undisturbed plant near a state and an action.
 
@@ -530,10 +619,11 @@ def nearest_steady_state(
     """
     if not plant.scenario.plant.mapping.initial_state:
         return plant.reset(0), action, plant.step(action).stage_cost
-    lower, upper = plant.scenario.action_lower, plant.scenario.action_upper
+    n = len(state)
     low, high = plant.state_range
-    bounds = np.concatenate([low, lower]), np.concatenate([high, upper])
-    start, n = np.concatenate([state, action]), len(state)
+    lower = np.concatenate([low, plant.scenario.action_lower])
+    upper = np.concatenate([high, plant.scenario.action_upper])
+    start = np.concatenate([state, action])
     scale: Array = np.maximum(np.abs(start), 1e-2)
 
     def residual(z: Array) -> Array:
@@ -541,10 +631,12 @@ def nearest_steady_state(
         return (plant.step(z[n:]).s - z[:n]) / scale[:n]
 
     precise = {"diff_step": DIFFERENCE, "gtol": 1e-15, "ftol": None, "xtol": None}
-    start = np.clip(start, *bounds)
-    with np.errstate(divide="ignore", invalid="ignore"):  # SciPy's own, of a step that is lost
-        result = least_squares(residual, start, "3-point", bounds, x_scale=scale, **precise)
-    z, left = result.x, float(np.max(np.abs(result.fun)))
+    start = np.clip(start, lower, upper)
+    # SciPy's own warnings, of a step that is lost.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        result = least_squares(residual, start, "3-point", (lower, upper), x_scale=scale, **precise)
+    z = result.x
+    left = float(np.max(np.abs(result.fun)))
     if left > LOOSE:
         raise PlantError(
             f"FMU '{plant.fmu_path.name}' has no steady state near its start values (a sample "

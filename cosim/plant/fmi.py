@@ -48,7 +48,16 @@ MAX_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class UnpackedFmu:
-    """An FMU on disk: the archive's path and SHA-256, the folder that holds its content."""
+    """An FMU on disk.
+
+    Attributes:
+        path: of the archive.
+        sha256: of the archive.
+        folder: holds its content.
+        description: the model description, as fmpy reads it.
+        entries: names of the archive's entries.
+        flaws: what the description has against FMI's schema and rules, none of which bars a run.
+    """
 
     path: Path
     sha256: str
@@ -56,7 +65,6 @@ class UnpackedFmu:
     description: Any
     entries: frozenset[str]
     flaws: tuple[str, ...] = ()
-    """What the model description has against FMI's schema and rules, none of which bars a run."""
 
     @cached_property
     def variables(self) -> dict[str, Any]:
@@ -65,8 +73,11 @@ class UnpackedFmu:
 
     def variable(self, name: str) -> Any:
         """Variable `name`, or the array whose element ``NAME[…]`` it is; None if there is none."""
+        # Many tools write elements as scalars of such a name.
+        if name in self.variables:
+            return self.variables[name]
         array = self.variables.get(name.partition("[")[0])
-        return self.variables.get(name, array if array is not None and array.shape else None)
+        return array if array is not None and array.shape else None
 
     def unit(self, name: str) -> str:
         """Unit of a variable or an array's element; empty where it is not stated."""
@@ -82,42 +93,49 @@ class UnpackedFmu:
         """
         variable = self.variable(name)
         declared = getattr(variable, "declaredType", None)
-        scale = max(
-            1.0,
-            *(abs(number(getattr(variable, field, None), 0.0)) for field in ("start", "nominal")),
-        )
-        limits = []
-        for field, none in (("min", -inf), ("max", inf)):
+        start = number(getattr(variable, "start", None), 0.0)
+        nominal = number(getattr(variable, "nominal", None), 0.0)
+        scale = max(1.0, abs(start), abs(nominal))
+        is_integer = variable is not None and variable.type not in _REALS
+
+        def limit(field: str, none: float) -> float:
             stated = getattr(variable, field, None)
             if stated is None:
                 stated = getattr(declared, field, None)
-            limit = number(stated, none)
-            is_end = variable is not None and variable.type not in _REALS and limit in _ENDS
-            limits.append(none if is_end or not abs(limit) < NO_BOUND * scale else limit)
-        return limits[0], limits[1]
+            value = number(stated, none)
+            if is_integer and value in _ENDS:
+                return none
+            return value if abs(value) < NO_BOUND * scale else none
+
+        return limit("min", -inf), limit("max", inf)
 
 
 NO_BOUND = 1e15
 """Ratio of a bound to a variable's scale from which it is none: a double has 15 digits."""
 _REALS = ("Real", "Float64", "Float32")
-_ENDS = {
-    float(end)
-    for bits in (8, 16, 32, 64)
-    for end in (-(1 << bits - 1), (1 << bits - 1) - 1, (1 << bits) - 1)
-}
+_ENDS: set[float] = set()
+"""Least and greatest integers of each type, with a sign and without."""
+for _bits in (8, 16, 32, 64):
+    _half = 1 << _bits - 1
+    _ENDS |= {float(-_half), float(_half - 1), float(2 * _half - 1)}
 
 
 def number(stated: str | float | None, otherwise: float) -> float:
-    """A number as a model description states it; `otherwise` where it states none or no number."""
+    """A number as a model description states it.
+
+    Args:
+        stated: its text.
+        otherwise: what it is where the text is missing or no number.
+    """
     try:
-        found = otherwise if stated is None else float(stated)
+        value = otherwise if stated is None else float(stated)
     except ValueError:
         return otherwise
-    return otherwise if isnan(found) else found
+    return otherwise if isnan(value) else value
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
-_lock = threading.Lock()
+_unpack_lock = threading.Lock()
 
 
 def unpack(fmu: str | Path) -> UnpackedFmu:
@@ -140,7 +158,7 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
         why = getattr(error, "strerror", None) or error
         raise PlantError(f"FMU '{path}' cannot be read: {why}") from None
     key = (path, status.st_mtime_ns, status.st_size)
-    with _lock:
+    with _unpack_lock:
         if key not in _unpacked or not _unpacked[key].folder.is_dir():
             _unpacked[key] = _unpack(path)
         return _unpacked[key]
@@ -181,13 +199,10 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
         raise PlantError(f"FMU '{path}' is refused: unpacks to more than {MAX_BYTES >> 20} MiB")
     for entry in entries:
         entry.filename = entry.filename.replace("\\", "/")
-        name = PurePosixPath(entry.orig_filename.replace("\\", "/"))
-        if (
-            ":" in entry.orig_filename
-            or name.is_absolute()
-            or ".." in name.parts
-            or "\0" in entry.orig_filename
-        ):
+        original = entry.orig_filename
+        name = PurePosixPath(original.replace("\\", "/"))
+        # zipfile cuts a name at a null byte; a colon is a drive on Windows.
+        if name.is_absolute() or ".." in name.parts or {":", "\0"} & set(original):
             raise PlantError(
                 f"FMU '{path}' is refused: entry {entry.orig_filename!r} leads outside its folder"
             )
@@ -215,7 +230,11 @@ def _describe(path: Path, folder: Path) -> tuple[Any, tuple[str, ...]]:
     return description, flaws
 
 
-def _describe_leniently(path: Path, folder: Path, flaws: tuple[str, ...]) -> Any:
+def _describe_leniently(
+    path: Path,
+    folder: Path,
+    flaws: tuple[str, ...],
+) -> Any:
     """The description of an FMU that failed the validation, with a warning that names the flaws.
 
     Raises PlantError where it cannot be read, or lacks what a run needs.
@@ -260,8 +279,14 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
     It lies in a `cosim.core.files.cache_folder`, whose path has no escapes in its URI, since many
-    FMUs do not read those in the URI of their resources. Raises OSError and what zipfile raises
-    where the archive cannot be unpacked.
+    FMUs do not read those in the URI of their resources.
+
+    Args:
+        archive: the FMU.
+        sha256: of its bytes, which names the folder.
+
+    Raises:
+        OSError: the archive cannot be unpacked; zipfile raises more types.
     """
     cache = cache_folder("fmus", plain=True)
     folder = cache / sha256
@@ -282,12 +307,13 @@ def _holds(folder: Path, archive: zipfile.ZipFile) -> bool:
     # Unpacking leaves the last of entries with one name.
     entries = {entry.filename: entry for entry in archive.infolist() if not entry.is_dir()}
     try:
-        return all(
-            not (folder / name).is_symlink() and (folder / name).read_bytes() == archive.read(entry)
-            for name, entry in entries.items()
-        )
+        for name, entry in entries.items():
+            path = folder / name
+            if path.is_symlink() or path.read_bytes() != archive.read(entry):
+                return False
     except OSError:
         return False
+    return True
 
 
 # FMI 2.0's names are for x86, but exporters on ARM use them as well.
@@ -305,7 +331,8 @@ def library_path(fmu: UnpackedFmu) -> Path:
         raise PlantError(
             f"FMU '{fmu.path}' is refused: modelIdentifier {identifier!r} is not a C identifier"
         )
-    platform, version = present(), str(fmu.description.fmiVersion)
+    platform = present()
+    version = str(fmu.description.fmiVersion)
     folders = [platform.folder(version)]
     if version.startswith("2") and platform.tuple in _FALLBACKS:
         folders.append(_FALLBACKS[platform.tuple])
@@ -321,8 +348,12 @@ def library_path(fmu: UnpackedFmu) -> Path:
             return path
         what = f"made for {' and '.join(made_for)}" if made_for else "not a shared library"
         reasons.append(f"its '{entry}' is {what}")
-    files = [name.split("/") for name in fmu.entries if not name.endswith("/")]
-    filled = {parts[1] for parts in files if parts[0] == "binaries" and len(parts) > 2}
+    # Which platforms the archive has anything for.
+    filled = set()
+    for name in fmu.entries:
+        parts = name.split("/")
+        if parts[0] == "binaries" and len(parts) > 2 and not name.endswith("/"):
+            filled.add(parts[1])
     why = "; ".join(reasons) or f"it has: {', '.join(sorted(filled)) or 'none'}"
     raise PlantError(
         f"FMU '{fmu.path}' has no binary for {platform.tuple} ({why}); build one from its sources, "
@@ -330,7 +361,11 @@ def library_path(fmu: UnpackedFmu) -> Path:
     )
 
 
-def _instead(fmu: UnpackedFmu, folder: str, entry: str) -> list[str]:
+def _instead(
+    fmu: UnpackedFmu,
+    folder: str,
+    entry: str,
+) -> list[str]:
     """What a platform's folder has in place of the library; nothing where there is no folder."""
     prefix = f"binaries/{folder}/"
     inside = sorted(name for name in fmu.entries if name.startswith(prefix))
@@ -347,10 +382,14 @@ _alive: Counter[str] = Counter()
 
 
 class Place(NamedTuple):
-    """Where a number is in an FMU: value reference and FMI type of its variable; of an array, which
-    element, row by row, and the values that all its elements start from.
+    """Where a number is in an FMU.
 
-    A `structural` parameter (FMI 3.0) is set in configuration mode.
+    Attributes:
+        reference: value reference of its variable.
+        type: FMI's type.
+        element: of an array, which one, row by row.
+        starts: values that all elements start from.
+        structural: whether it is a structural parameter (FMI 3.0), set in configuration mode.
     """
 
     reference: int
@@ -408,10 +447,19 @@ class Native(ctypes.Structure):
 
     _fields_: ClassVar[list[tuple[str, Any]]] = [
         ("version", ctypes.c_int),
-        *((name, ctypes.c_void_p) for name in ("set", "get", "step", "component")),
-        *((name, ctypes.c_void_p) for name in ("inputs", "outputs", "states")),
-        *((name, ctypes.c_size_t) for name in ("n_inputs", "n_outputs", "n_states")),
-        *((name, ctypes.c_void_p) for name in ("input", "output", "state")),
+        ("set", ctypes.c_void_p),
+        ("get", ctypes.c_void_p),
+        ("step", ctypes.c_void_p),
+        ("component", ctypes.c_void_p),
+        ("inputs", ctypes.c_void_p),
+        ("outputs", ctypes.c_void_p),
+        ("states", ctypes.c_void_p),
+        ("n_inputs", ctypes.c_size_t),
+        ("n_outputs", ctypes.c_size_t),
+        ("n_states", ctypes.c_size_t),
+        ("input", ctypes.c_void_p),
+        ("output", ctypes.c_void_p),
+        ("state", ctypes.c_void_p),
         ("start_time", ctypes.c_double),
         ("step_size", ctypes.c_double),
         ("order", ctypes.c_int),
@@ -472,7 +520,11 @@ def _copy_of(library: Path) -> Iterator[Path]:
             Path(name).unlink()
 
 
-def _why_not_loaded(words: str, library: str, name: str) -> str:
+def _why_not_loaded(
+    words: str,
+    library: str,
+    name: str,
+) -> str:
     """What keeps a library, which is there, from being loaded; `words` are the system's."""
     missing, _, rest = words.partition(": cannot open shared object file: No such file")
     if rest and missing != library:
@@ -487,9 +539,23 @@ class Instance(ABC):
     """One co-simulation instance, called through raw function pointers and fixed buffers.
 
     The pointers carry no argument types: ctypes then passes the ready-made C objects through,
-    at half the cost of a checked call. `exchanged` are the places of inputs, outputs and states;
-    `inputs`, `outputs` and `states` are their buffers, the last two with a NumPy view of the same
-    memory (`…_view`).
+    at half the cost of a checked call.
+
+    Args:
+        fmu: the file.
+        exchanged: places of inputs, outputs and states.
+        starts: places and start values.
+        step_size: communication step in s.
+        reading: when a step reads the outputs.
+        experiment: start time, stop time, tolerance.
+        intermediate: is called after each internal step (FMI 3.0); None: nobody is.
+
+    Attributes:
+        inputs, outputs, states: buffers of what is exchanged.
+        outputs_view, states_view: NumPy's views of the same memory.
+        messages: latest words of the FMU's log.
+        fatal: whether a call has ended in a fatal error.
+        drivable: whether compiled code can exchange all values.
     """
 
     prefix: ClassVar[str]
@@ -542,14 +608,23 @@ class Instance(ABC):
         self._first, self._second, self._third = self._calls_of_a_step(reading)
         self._to_start = self._calls_to_start()
         self._start_places = [place for place, _ in starts]
-        structural = [(place, value) for place, value in starts if place.structural]
+        # Sizes of arrays come first, in a mode of their own (FMI 3.0).
+        structure_places: list[Place] = []
+        structure_values: list[float] = []
+        places: list[Place] = []
+        values: list[float] = []
+        for place, value in starts:
+            if place.structural:
+                structure_places.append(place)
+                structure_values.append(value)
+            else:
+                places.append(place)
+                values.append(value)
         self._set_structure: Callable[[], None] | None = None
-        if structural:
-            self._set_structure = self.writer(*zip(*structural, strict=True))
-        plain = [(place, value) for place, value in starts if not place.structural]
-        places = [place for place, _ in plain]
+        if structure_places:
+            self._set_structure = self.writer(structure_places, structure_values)
         self._starts, self._set_starts = self._exchange(places, "Set")
-        self._starts[:] = [value for _, value in plain]
+        self._starts[:] = values
         # FMI 2 counts value references anew for each type.
         self._start_of = {place[:3]: i for i, place in enumerate(places)}
 
@@ -599,13 +674,15 @@ class Instance(ABC):
     def _function(self, name: str) -> Any:
         """A function pointer of our own, free of the argument types that fmpy attaches."""
         if name not in self._functions:
-            pointer = self._functions[name] = self._slave.dll[self.prefix + name]
+            pointer = self._slave.dll[self.prefix + name]
             pointer.restype = ctypes.c_int
+            self._functions[name] = pointer
         return self._functions[name]
 
     def _call(self, name: str, *arguments: Any) -> None:
         """Call a function of FMI; raises PlantError where it fails."""
-        if (status := self._function(name)(*arguments)) and status != WARNING:
+        status = self._function(name)(*arguments)
+        if status and status != WARNING:
             self.fail(name, status)
 
     def initialise(self, started: bool) -> None:
@@ -630,7 +707,8 @@ class Instance(ABC):
         self._time.value = time
         self._first()
         self._second()
-        if (status := self._do_step(*self._step_arguments)) and status != WARNING:
+        status = self._do_step(*self._step_arguments)
+        if status and status != WARNING:
             self.fail("DoStep", status)
         self._third()
 
@@ -645,9 +723,19 @@ class Instance(ABC):
         return list(self.outputs)
 
     def take_step(self, time: float, size: float) -> list[float]:
-        """Step from `time` by `size` [s], and nothing else; return the states after it."""
-        self._time.value, self._step_size.value = time, size
-        if (status := self._do_step(*self._step_arguments)) and status != WARNING:
+        """Step, and nothing else.
+
+        Args:
+            time: from which, in s.
+            size: how far, in s.
+
+        Returns:
+            The states after it.
+        """
+        self._time.value = time
+        self._step_size.value = size
+        status = self._do_step(*self._step_arguments)
+        if status and status != WARNING:
             self.fail("DoStep", status)
         self._get_states()
         return list(self.states)
@@ -660,7 +748,9 @@ class Instance(ABC):
 
     def _calls_of_a_step(self, reading: Reading) -> tuple[Callable[[], None], ...]:
         """What is called before the step, first and second, and after it."""
-        set_inputs, get_outputs, get_states = self._set_inputs, self._get_outputs, self._get_states
+        set_inputs = self._set_inputs
+        get_outputs = self._get_outputs
+        get_states = self._get_states
         if reading.order is Order.SET_STEP_GET:
 
             def get_all() -> None:
@@ -673,7 +763,8 @@ class Instance(ABC):
             before = (get_outputs, set_inputs)
         if not reading.late:
             return *before, get_states
-        late, outputs = reading.late, self.outputs
+        late = reading.late
+        outputs = self.outputs
         values, get_late = self._exchange([self._places[1][i] for i in late], "Get")
 
         def get_late_and_states() -> None:
@@ -693,7 +784,8 @@ class Instance(ABC):
             arguments = self._arguments([place.reference for place in places], buffer)
 
             def exchange() -> None:
-                if (status := function(*arguments)) and status != WARNING:
+                status = function(*arguments)
+                if status and status != WARNING:
                     self.fail(name, status)
 
             return buffer, exchange
@@ -720,11 +812,21 @@ class Instance(ABC):
         return numbers, convert
 
     def change_start(self, place: Place, value: float) -> None:
-        """Replace the start value of a place among the `starts` for the next reset."""
+        """Replace a start value for the next reset.
+
+        Args:
+            place: one among the `starts`.
+            value: the new one.
+        """
         self._starts[self._start_of[place[:3]]] = value
 
     def writer(self, places: Sequence[Place], values: Sequence[float]) -> Callable[[], None]:
-        """A function that writes values between two steps."""
+        """A function that writes values between two steps.
+
+        Args:
+            places: where.
+            values: one for each place.
+        """
         buffer, write = self._exchange(places, "Set")
         buffer[:] = values
         return write
@@ -744,20 +846,24 @@ class Instance(ABC):
 
     @cached_property
     def _native(self) -> Native:
+        def address(item: Any) -> Any:
+            return ctypes.cast(item, ctypes.c_void_p)
+
         buffers = (self.inputs, self.outputs, self.states)
-        # Keep them: compiled code has only their addresses.
-        self._references = [
-            self._arguments([place.reference for place in places], buffer)[1]
-            for places, buffer in zip(self._places, buffers, strict=True)
-        ]
-        calls = (f"Set{self.real}", f"Get{self.real}", "DoStep")
+        # Kept: compiled code has only their addresses.
+        self._references = []
+        for places, buffer in zip(self._places, buffers, strict=True):
+            references = [place.reference for place in places]
+            self._references.append(self._arguments(references, buffer)[1])
         return Native(
             int(self.prefix[-1]),
-            *(ctypes.cast(self._function(call), ctypes.c_void_p) for call in calls),
+            address(self._function(f"Set{self.real}")),
+            address(self._function(f"Get{self.real}")),
+            address(self._function("DoStep")),
             self._component,
-            *(ctypes.cast(each, ctypes.c_void_p) for each in self._references),
-            *(len(each) for each in buffers),
-            *(ctypes.cast(each, ctypes.c_void_p) for each in buffers),
+            *map(address, self._references),
+            *map(len, buffers),
+            *map(address, buffers),
             self.experiment.start_time,
             self._step_size.value,
             self._order,
@@ -765,7 +871,12 @@ class Instance(ABC):
         )
 
     def fail_native(self, fault: int, status: int) -> None:
-        """Raise PlantError for the fault of a compiled loop."""
+        """Raise PlantError for the fault of a compiled loop.
+
+        Args:
+            fault: number of what failed (`loop.h`).
+            status: FMI's.
+        """
         names = (f"Set{self.real}", f"Get{self.real}", "DoStep", "DoStep")
         if fault == len(names):
             self.messages.append("the FMU ended the run, or the step early")
@@ -800,7 +911,15 @@ class Instance(ABC):
         return buffer.raw
 
     def deserialise(self, data: bytes, handle: ctypes.c_void_p) -> None:
-        """Fill a handle from bytes; raises PlantError if the FMU refuses them."""
+        """Fill a handle from bytes.
+
+        Args:
+            data: what `serialise` returned.
+            handle: is filled.
+
+        Raises:
+            PlantError: the FMU refuses them.
+        """
         self.require_serialised_state()
         buffer = ctypes.create_string_buffer(data, len(data))
         size = ctypes.c_size_t(len(data))
@@ -813,7 +932,12 @@ class Instance(ABC):
             )
 
     def fail(self, function: str, status: int) -> NoReturn:
-        """Raise PlantError for a failed call, with the FMU's log messages."""
+        """Raise PlantError for a failed call, with the FMU's log messages.
+
+        Args:
+            function: its name without FMI's prefix.
+            status: what it returned.
+        """
         self.fatal |= status == FATAL
         label = _STATUS.get(status, f"status {status}, which FMI does not have")
         raise PlantError(
@@ -845,12 +969,16 @@ def _nothing() -> None:
     """Take the place of a call that is not needed."""
 
 
-_numbers = itertools.count()
+_instance_numbers = itertools.count()
 _logs: WeakValueDictionary[bytes, deque[str]] = WeakValueDictionary()
 
 
 def _log(
-    _: Any, instance: bytes | None, status: int, category: bytes | None, message: bytes | None
+    _: Any,
+    instance: bytes | None,
+    status: int,
+    category: bytes | None,
+    message: bytes | None,
 ) -> None:
     """Keep a message for the error that may follow.
 
@@ -874,7 +1002,7 @@ _callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
 addLoggerProxy(ctypes.byref(_callbacks))
 
 
-def _told(value: float | None, truth: Any) -> tuple[Any, Any]:
+def _optional(value: float | None, truth: Any) -> tuple[Any, Any]:
     """FMI's two arguments of a value that may be undefined: whether it is defined, and it."""
     return truth(value is not None), ctypes.c_double(0.0 if value is None else value)
 
@@ -895,9 +1023,9 @@ class Fmi2Instance(Instance):
 
     def _calls_to_start(self) -> tuple[tuple[str, tuple[Any, ...]], ...]:
         start, stop, tolerance = self.experiment
-        given = (*_told(tolerance, ctypes.c_int), ctypes.c_double(start))
+        given = (*_optional(tolerance, ctypes.c_int), ctypes.c_double(start))
         return (
-            ("SetupExperiment", (*given, *_told(stop, ctypes.c_int))),
+            ("SetupExperiment", (*given, *_optional(stop, ctypes.c_int))),
             ("EnterInitializationMode", ()),
             ("ExitInitializationMode", ()),
         )
@@ -907,7 +1035,7 @@ class Fmi2Instance(Instance):
         return (self._component, self._time, self._step_size, self.no_return)
 
     def _instantiate(self, **where: Any) -> Any:
-        name = f"cosim-{next(_numbers)}"
+        name = f"cosim-{next(_instance_numbers)}"
         _logs[name.encode()] = self.messages
         slave = FMU2ByPath(instanceName=name, **where)
         slave.instantiate(callbacks=_callbacks, loggingOn=True)
@@ -937,26 +1065,40 @@ class Fmi3Instance(Instance):
 
     def _calls_to_start(self) -> tuple[tuple[str, tuple[Any, ...]], ...]:
         start, stop, tolerance = self.experiment
-        given = (*_told(tolerance, ctypes.c_bool), ctypes.c_double(start))
+        given = (*_optional(tolerance, ctypes.c_bool), ctypes.c_double(start))
         return (
-            ("EnterInitializationMode", (*given, *_told(stop, ctypes.c_bool))),
+            ("EnterInitializationMode", (*given, *_optional(stop, ctypes.c_bool))),
             ("ExitInitializationMode", ()),
         )
 
     @cached_property
     def _step_arguments(self) -> tuple[Any, ...]:
-        event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
+        event = ctypes.c_bool()
+        self._terminate = ctypes.c_bool()
+        self._early = ctypes.c_bool()
         # Infinite where an FMU does not say how far it came.
         self._last_time = ctypes.c_double(inf)
-        found = (event, self._terminate, self._early, self._last_time)
         self.no_return = ctypes.c_bool(self.no_return.value)
-        given = (self._component, self._time, self._step_size, self.no_return)
-        return (*given, *(ctypes.byref(each) for each in found))
+        return (
+            self._component,
+            self._time,
+            self._step_size,
+            self.no_return,
+            ctypes.byref(event),
+            ctypes.byref(self._terminate),
+            ctypes.byref(self._early),
+            ctypes.byref(self._last_time),
+        )
 
     def _instantiate(self, **where: Any) -> Any:
         messages = self.messages
 
-        def log(_: Any, status: int, category: bytes, message: bytes) -> None:
+        def log(
+            _: Any,
+            status: int,
+            category: bytes,
+            message: bytes,
+        ) -> None:
             messages.append(message.decode("utf-8", "replace"))
 
         slave = FMU3ByPath(**where)
@@ -969,15 +1111,14 @@ class Fmi3Instance(Instance):
             return {}
         # fmpy does not read the attribute, an xs:boolean.
         elements = ElementTree.parse(self.fmu.folder / DESCRIPTION).iter()
-        offered = {
-            e.get("valueReference")
-            for e in elements
-            if e.get("intermediateUpdate") in ("true", "1")
-        }
+        offered = set()
+        for element in elements:
+            if element.get("intermediateUpdate") in ("true", "1"):
+                offered.add(element.get("valueReference"))
         states = {place.reference for place in self._places[2]}
-        told = {str(state) for state in states} <= offered
-        update = {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}
-        return update if told else {}
+        if not {str(state) for state in states} <= offered:
+            return {}
+        return {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}
 
     def _update(self, _: Any, time: float, __: bool, readable: bool, *___: Any) -> None:
         """Tell of the states; the FMU calls it in a step."""

@@ -48,11 +48,21 @@ class FmuPlant:
     `plant.start_time` + k·h. Use it as a context manager, or call `close`. An FMU is native code:
     name only files that you trust.
 
-    `scenario` is a `Scenario` or what `Scenario.load` takes; `fmu`, a shipped one's name or a path,
-    replaces the scenario's. `intermediate` is called with time [s] and states (n,) after each
-    internal step of an FMI 3.0 FMU that provides these values. Raises PlantError if the FMU is
-    missing, corrupt, has no co-simulation binary for this platform or lacks a variable that the
-    scenario names; CapabilityError once a capability that the FMU lacks is used.
+    Args:
+        scenario: a `Scenario` or what `Scenario.load` takes.
+        fmu: a shipped one's name or a path, in place of the scenario's.
+        intermediate: is called with time [s] and states (n,) after each internal step of an FMI 3.0
+            FMU that provides these values.
+
+    Attributes:
+        units: unit of each variable of the scenario, by name.
+        state_range: least and greatest values of the states, (n,) each, as the FMU states them.
+        drivable: whether compiled code can step the FMU (`drive`).
+
+    Raises:
+        PlantError: the FMU is missing, corrupt, has no co-simulation binary for this platform or
+            lacks a variable that the scenario names.
+        CapabilityError: a capability that the FMU lacks is used.
     """
 
     def __init__(
@@ -68,6 +78,7 @@ class FmuPlant:
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
         self._h = self.scenario.sampling_time
         step = self.scenario.plant.communication_step or self._h
+        # The first reason suffices: the others may follow from it.
         for refusal in refusals(archive, step):
             raise PlantError(refusal)
         wiring = Wiring(self.scenario, archive)
@@ -81,19 +92,24 @@ class FmuPlant:
         ranges = np.array([archive.range(name) for name in plant.states])
         self.state_range = ranges[:, 0], ranges[:, 1]
         self.penalty = self.scenario.state_penalty
-        self._seeds, self._initial = wiring.seeds, wiring.initial
+        self._seeds = wiring.seeds
+        self._initial = wiring.initial
         self._asked = list(plant.initial_state)
         self._elsewhere = False
         self._m = len(plant.actions)
         self._k = _NOT_STARTED
-        self._started = self._saves = False
+        self._started = False
+        self._saves = False
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
-        self._wiring, self._intermediate = wiring, intermediate
+        self._wiring = wiring
+        self._intermediate = intermediate
+        # What the FMU was seen to do decides, not what its description says.
         self._probe = probe_of(subject_of(self.scenario, archive, wiring))
         self._reading = self._probe.reading
         if plant.outputs is not None:
             self._reading = self._probe.stated(plant.outputs)
+        # A scenario with a model of its plant is for comparisons with the optimum.
         if plant.model is not None:
             self.require_cost_of_sample()
         if self._probe.misfit:
@@ -158,11 +174,21 @@ class FmuPlant:
         return self._copy_states()
 
     def reset(self, seed: int, initial_state: Sequence[float] | Array | None = None) -> Array:
-        """Start again at k = 0 with the disturbances of a seed in [0, 2⁶⁴); return the state (n,).
+        """Start again at k = 0; every start value is written.
 
-        `initial_state` (n,) replaces the scenario's for this episode. Every start value is written.
+        Args:
+            seed: of the disturbances, in [0, 2⁶⁴).
+            initial_state: in place of the scenario's for this episode, (n,).
+
+        Returns:
+            The state, (n,).
+
+        Raises:
+            PlantError: the FMU fails, or starts elsewhere than it was asked to.
+            CapabilityError: it cannot begin a second episode.
         """
         fmi = self._instance
+        # Before anything changes: a wrong seed leaves the plant as it is.
         words = seed_words(seed, self._seeds)
         if self._started and not self._resets:
             fmi = self._begin_anew()
@@ -187,9 +213,11 @@ class FmuPlant:
                 "repeat the first start, and it can be instantiated only once per process"
             )
         self._instance.close(self._handles)
-        self._handles, self._free_handles = [], []
+        self._handles = []
+        self._free_handles = []
         self._started = False
-        self._elsewhere, self._asked = False, list(self.scenario.plant.initial_state)
+        self._elsewhere = False
+        self._asked = list(self.scenario.plant.initial_state)
         self._instantiate()
         return self._instance
 
@@ -205,6 +233,7 @@ class FmuPlant:
 
     def step(self, a: Sequence[float] | Array) -> Step:
         """Hold the action a (m,) for one sampling time; raises PlantError, then needs a reset."""
+        # A sum is finite where each of its terms is: one call for all of them.
         try:
             values = a.tolist() if isinstance(a, np.ndarray) else list(a)
             acceptable = len(values) == self._m and isfinite(sum(values))
@@ -216,12 +245,15 @@ class FmuPlant:
         if self._k < 0:
             self._running()
         self._inputs[:] = values
-        penalty, k = self._penalty_now, self._k
+        penalty = self._penalty_now
+        k = self._k
+        # Until the step is done: after an error the plant needs a reset.
         self._k = _NOT_STARTED
         if self._changes and k in self._changes:
             self._changes[k]()
         self._advance(self._start_time + k * self._h)
-        states, cost = self._states[:], self._outputs[0]
+        states = self._states[:]
+        cost = self._outputs[0]
         if not isfinite(cost + sum(states)):
             self._refuse_output(k)
         self._k = k + 1
@@ -232,24 +264,38 @@ class FmuPlant:
         """Step through a sample; the outputs are those of its first step."""
         fmi = self._instance
         fmi.advance(time)
+        # Stage cost and disturbance are those of the sample's begin.
         outputs = self._outputs[:]
         for i in range(1, self._steps):
             fmi.advance(time + i * self._h / self._steps)
         self._outputs[:] = outputs
 
     def drive(self, loop: CompiledLoop, table: Array) -> Array:
-        """Take the next samples in a compiled loop, a row of `table` each; return the state (n,).
+        """Let the next samples pass in a compiled loop; as many calls of `step` give the same.
 
-        As many calls of `step` give the same. Raises PlantError, then needs a reset.
+        Args:
+            loop: the controller's.
+            table: gets a row for each sample.
+
+        Returns:
+            The state, (n,).
+
+        Raises:
+            PlantError: the FMU fails; it then needs a reset.
         """
         fmi = self._running()
-        k, first, end = self._k, self._k, self._k + len(table)
+        first = self._k
+        end = first + len(table)
+        k = first
         self._k = _NOT_STARTED
         while k < end:
             if k in self._changes:
                 self._changes[k]()
-            stop = min((change for change in self._changes if change > k), default=end)
-            stop = min(stop, end)
+            # Up to the next change of the plant's parameters.
+            stop = end
+            for change in self._changes:
+                if k < change < stop:
+                    stop = change
             k, fault, status = loop(fmi.native, k, table[k - first : stop - first])
             if fault == NOT_FINITE:
                 self._refuse_output(k)
@@ -262,6 +308,7 @@ class FmuPlant:
     def snapshot(self) -> Snapshot:
         """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""
         fmi = self._running()
+        # The proof takes some steps of another instance: once a plant.
         if not self._saves:
             fmi.require_state()
             self._require_proof(self._probe.snapshots, "save and restore")
@@ -290,11 +337,13 @@ class FmuPlant:
         fmi = self._instance
         if len(data) < _HEADER.size:
             raise PlantError("these bytes are not a serialised plant state")
+        # Another build of the same model may lay out its memory otherwise.
         k, digest = _HEADER.unpack_from(data)
         if digest.hex() != self.fmu_sha256:
             raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
         fmi.require_serialised_state()
         self._require_proof(self._probe.serialises, "serialise")
+        # So that every later call finds an initialised instance.
         if not self._started:
             self.reset(0)
         handle = self._handle(fmi)
@@ -321,12 +370,18 @@ class FmuPlant:
         """Memory of a dropped snapshot, or a null handle, which the FMU allocates."""
         fmi.no_return.value = False
         if not self._free_handles:
-            self._handles.append(handle := ctypes.c_void_p())
+            handle = ctypes.c_void_p()
+            self._handles.append(handle)
             return handle
         return self._free_handles.pop()
 
     def recycle(self, instance: Instance, handle: ctypes.c_void_p) -> None:
-        """Keep a dropped snapshot's memory for the next one; each snapshot calls this."""
+        """Keep a dropped snapshot's memory for the next one; each snapshot calls this.
+
+        Args:
+            instance: of which it is.
+            handle: the memory.
+        """
         if instance is self._fmi:
             self._free_handles.append(handle)
             instance.no_return.value = len(self._free_handles) == len(self._handles)
@@ -335,7 +390,8 @@ class FmuPlant:
         """Free the FMU instance and every snapshot; a closed plant refuses all calls."""
         if self._fmi is None:
             return
-        fmi, self._fmi = self._fmi, None
+        fmi = self._fmi
+        self._fmi = None
         self._k = _NOT_STARTED
         fmi.close(self._handles)
 
@@ -386,5 +442,5 @@ class FmuPlant:
         table = self.scenario.plant
         values = {table.stage_cost: self._outputs[0]}
         values |= dict(zip(table.states, self._states, strict=True))
-        bad = ", ".join(f"{name} = {value}" for name, value in values.items() if value - value != 0)
+        bad = ", ".join(f"{name} = {x}" for name, x in values.items() if not isfinite(x))
         raise PlantError(f"FMU '{self.fmu_path.name}' returned {bad} at step {k}")

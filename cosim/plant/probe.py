@@ -33,7 +33,7 @@ from cosim.plant.fmi import (
 from cosim.plant.wiring import REALS, Wiring, experiment, has_start, interface
 
 
-class Kind(Enum):
+class OutputKind(Enum):
     """Where the numbers of an output belong, and what shows it."""
 
     FOLLOWS = "follows the actions at once"
@@ -48,8 +48,8 @@ class Kind(Enum):
     OPEN = "cannot be told"
 
 
-BEFORE = (Kind.FOLLOWS, Kind.INSTANT)
-AFTER = (Kind.SAMPLE, Kind.END)
+BEFORE = (OutputKind.FOLLOWS, OutputKind.INSTANT)
+AFTER = (OutputKind.SAMPLE, OutputKind.END)
 
 
 class Restart(Enum):
@@ -73,17 +73,24 @@ class Row:
 class Report:
     """What was found out about an FMU as a plant.
 
-    `rows` tell it; the other fields are the same for programs. `outputs` is the value of
-    `plant.outputs` that fits, None where the outputs differ; `kinds` says where each output
-    belongs, by name, stage cost first. `still` are the actions that move no state, and whether
-    they move an output; `undriven` the inputs that nobody sets, with their start values.
+    Attributes:
+        fmu, sha256: the file.
+        rows: tell it; the other fields are the same for programs.
+        outputs: the value of `plant.outputs` that fits; None where the outputs differ.
+        kinds: where each output belongs, by name, stage cost first.
+        restart: how a second episode begins.
+        snapshots, serialises: whether a saved, or serialised, state can be relied on.
+        experiment: what the FMU has to be given.
+        still: actions that move no state, and whether they move an output.
+        undriven: inputs that nobody sets, with their start values.
+        starts_anywhere: whether the initial state can be set.
     """
 
     fmu: Path
     sha256: str
     rows: tuple[Row, ...]
     outputs: str | None
-    kinds: dict[str, Kind]
+    kinds: dict[str, OutputKind]
     restart: Restart
     snapshots: bool
     serialises: bool
@@ -97,9 +104,15 @@ class Report:
 class Subject:
     """An FMU with what a probe needs to drive it.
 
-    `exchanged` are the places of inputs, outputs and states, `names` their names; `starts` the
-    start values, `start_names` the names of the first of them; `step` the communication step in s;
-    `low` and `high` two values of each input.
+    Attributes:
+        fmu: the file.
+        names: of inputs, outputs and states.
+        exchanged: their places.
+        starts: places and start values.
+        start_names: names of the first of these.
+        step: communication step in s.
+        experiment: what the FMU is given.
+        low, high: two values of each input, (m,).
     """
 
     fmu: UnpackedFmu
@@ -115,23 +128,38 @@ class Subject:
     @property
     def key(self) -> tuple[Any, ...]:
         """What a finding holds for."""
-        given = self.exchanged, self.starts, self.step, self.experiment, self.low, self.high
-        return (self.fmu.sha256, *given)
+        return (
+            self.fmu.sha256,
+            self.exchanged,
+            self.starts,
+            self.step,
+            self.experiment,
+            self.low,
+            self.high,
+        )
 
 
-def subject_of(scenario: Scenario, fmu: UnpackedFmu, wiring: Wiring) -> Subject:
-    """The FMU as a scenario wires it; its actions vary about the reference within the bounds."""
+def subject_of(
+    scenario: Scenario,
+    fmu: UnpackedFmu,
+    wiring: Wiring,
+) -> Subject:
+    """The FMU as a scenario wires it; its actions vary about the reference within the bounds.
+
+    Args:
+        scenario: names the variables.
+        fmu: the file.
+        wiring: the places of the scenario's variables.
+    """
     plant = scenario.plant
     step = plant.communication_step or scenario.sampling_time
     steps = round(scenario.sampling_time / step)
     pairs = []
-    for name, reference, bounds in zip(
-        plant.actions,
-        scenario.reference_action.tolist(),
-        zip(scenario.action_lower.tolist(), scenario.action_upper.tolist(), strict=True),
-        strict=True,
-    ):
-        pairs.append(_two_values(fmu.variable(name), reference, *bounds))
+    for i, name in enumerate(plant.actions):
+        reference = float(scenario.reference_action[i])
+        lower = float(scenario.action_lower[i])
+        upper = float(scenario.action_upper[i])
+        pairs.append(_two_values(fmu.variable(name), reference, lower, upper))
     return Subject(
         fmu=fmu,
         names=(plant.actions, (plant.stage_cost, *plant.disturbances), plant.states),
@@ -145,17 +173,25 @@ def subject_of(scenario: Scenario, fmu: UnpackedFmu, wiring: Wiring) -> Subject:
     )
 
 
-def _two_values(variable: Any, value: float, lower: float, upper: float) -> tuple[float, float]:
+def _two_values(
+    variable: Any,
+    value: float,
+    lower: float,
+    upper: float,
+) -> tuple[float, float]:
     """A value within bounds and the variable's own range, and another one."""
     lower = max(lower, number(variable.min, -np.inf))
     upper = min(upper, number(variable.max, np.inf))
     if variable.type not in REALS:
-        lower, upper, value = ceil(lower), floor(upper), round(value)
-    value = min(max(value, lower), upper)
-    if variable.type not in REALS:
+        lower = ceil(lower)
+        upper = floor(upper)
+        value = min(max(round(value), lower), upper)
         return value, float(upper if value != upper else lower)
+    value = min(max(value, lower), upper)
     distance = 0.25 * (upper - lower)
-    return value, value + distance if value + distance <= upper else value - distance
+    # Upwards, or downwards where that would leave the range.
+    other = value + distance
+    return value, other if other <= upper else value - distance
 
 
 def bare_subject(
@@ -165,14 +201,35 @@ def bare_subject(
     states: Sequence[str] = (),
     step: float | None = None,
 ) -> Subject:
-    """The FMU without a scenario; what is not named are its real inputs, outputs and states."""
+    """The FMU without a scenario.
+
+    Args:
+        fmu: the file.
+        actions: inputs to act on; without them its real inputs.
+        outputs: stage cost and disturbances; without them its real outputs that are no states.
+        states: its states; without them those with a derivative, else the outputs.
+        step: communication step in s; without it that of the default experiment.
+
+    Raises:
+        PlantError: the FMU has no such variable.
+    """
     known = fmu.variables
-    scalars = [v for v in fmu.description.modelVariables if v.type in REALS and not v.shape]
-    rates = [v.derivative.name for v in scalars if getattr(v, "derivative", None)]
-    all_outputs = [v.name for v in scalars if v.causality == "output"]
-    states = tuple(states or dict.fromkeys(rates) or all_outputs)
-    outputs = tuple(outputs or [name for name in all_outputs if name not in states])
-    actions = tuple(actions or [v.name for v in scalars if v.causality == "input"])
+    real_inputs = []
+    real_outputs = []
+    differentiated = []
+    for variable in fmu.description.modelVariables:
+        if variable.type not in REALS or variable.shape:
+            continue
+        if variable.causality == "input":
+            real_inputs.append(variable.name)
+        if variable.causality == "output":
+            real_outputs.append(variable.name)
+        # FMI marks the rate, which names the state.
+        if getattr(variable, "derivative", None):
+            differentiated.append(variable.derivative.name)
+    actions = tuple(actions or real_inputs)
+    states = tuple(states or dict.fromkeys(differentiated) or real_outputs)
+    outputs = tuple(outputs or [name for name in real_outputs if name not in states])
     default = fmu.description.defaultExperiment
     stated = step or number(getattr(default, "stepSize", None), 0.0)
     internal = number(fmu.description.coSimulation.fixedInternalStepSize, 0.0)
@@ -195,16 +252,16 @@ def bare_subject(
 
 
 def _places(fmu: UnpackedFmu, names: Sequence[str]) -> tuple[Place, ...]:
-    found = []
+    places = []
     for name in names:
         variable = fmu.variable(name)
         if variable is None:
             raise PlantError(f"FMU '{fmu.path.name}' has no variable '{name}'")
-        found.append(Place(int(variable.valueReference), str(variable.type)))
-    return tuple(found)
+        places.append(Place(int(variable.valueReference), str(variable.type)))
+    return tuple(places)
 
 
-class Sample(NamedTuple):
+class ProbedStep(NamedTuple):
     """Numbers of one step: outputs after the inputs were set (if one looked), states and outputs
     after the step.
     """
@@ -214,12 +271,12 @@ class Sample(NamedTuple):
     outputs: tuple[float, ...]
 
 
-class Run(NamedTuple):
+class ProbedRun(NamedTuple):
     """States and outputs after the initialisation, and the steps that followed."""
 
     states: tuple[float, ...]
     outputs: tuple[float, ...]
-    samples: tuple[Sample, ...]
+    samples: tuple[ProbedStep, ...]
 
 
 class _CannotStartAgainError(PlantError):
@@ -233,7 +290,8 @@ class _Bench:
     """
 
     def __init__(self, subject: Subject, experiment: Experiment) -> None:
-        self._subject, self._experiment = subject, experiment
+        self._subject = subject
+        self._experiment = experiment
         self._instance: Instance | None = None
         self._is_new = False
         self.resets = False
@@ -271,7 +329,8 @@ class _Bench:
         """Free the instance and what was saved of it."""
         if self._instance is not None:
             self._instance.close([self.handle])
-            self._instance, self.handle = None, ctypes.c_void_p()
+            self._instance = None
+            self.handle = ctypes.c_void_p()
 
     def run(
         self,
@@ -281,15 +340,21 @@ class _Bench:
         sizes: Sequence[float] = (),
         spacing: float | None = None,
         by_reset: bool | None = None,
-    ) -> Run:
-        """Start, and step under these inputs, by `sizes` [s] where they are not the step.
+    ) -> ProbedRun:
+        """Start, and step.
 
-        With `look` the outputs are also read after each set, which FMI forbids.
+        Args:
+            inputs: of each step, (m,).
+            look: whether the outputs are also read after each set, which FMI forbids.
+            sizes: lengths of the steps in s, where they are not the communication step.
+            spacing: seconds between the begins of two steps, where they are another time.
+            by_reset: forces how the instance is had.
         """
         fmi = self.start(by_reset=by_reset)
-        states, outputs = tuple(fmi.states), tuple(fmi.read_outputs())
+        states = tuple(fmi.states)
+        outputs = tuple(fmi.read_outputs())
         samples = self.go_on(fmi, inputs, look=look, sizes=sizes, spacing=spacing)
-        return Run(states, outputs, samples)
+        return ProbedRun(states, outputs, samples)
 
     def go_on(
         self,
@@ -300,27 +365,42 @@ class _Bench:
         look: bool = False,
         sizes: Sequence[float] = (),
         spacing: float | None = None,
-    ) -> tuple[Sample, ...]:
-        """Step from sample `first` on; samples lie `spacing` [s] apart, if not a step."""
-        step, samples = spacing or self._subject.step, []
+    ) -> tuple[ProbedStep, ...]:
+        """Step an instance.
+
+        Args:
+            fmi: it, before sample `first`.
+            inputs: of each step, (m,).
+            first: number of the first step.
+            look: whether the outputs are also read after each set, which FMI forbids.
+            sizes: lengths of the steps in s, where they are not the communication step.
+            spacing: seconds between the begins of two steps, where they are another time.
+        """
+        step = spacing or self._subject.step
         lengths = sizes or [step] * len(inputs)
+        samples = []
         for k, (values, size) in enumerate(zip(inputs, lengths, strict=True), first):
             fmi.write_inputs(values)
             looked = tuple(fmi.read_outputs()) if look else ()
-            states = tuple(fmi.take_step(self._experiment.start_time + k * step, size))
-            samples.append(Sample(looked, states, tuple(fmi.read_outputs())))
+            # Times are multiples of the step, never sums of it.
+            time = self._experiment.start_time + k * step
+            states = tuple(fmi.take_step(time, size))
+            samples.append(ProbedStep(looked, states, tuple(fmi.read_outputs())))
         return tuple(samples)
 
 
-def _same(one: Run | Sequence[Sample], other: Run | Sequence[Sample]) -> bool:
+def _same(one: ProbedRun | Sequence[ProbedStep], other: ProbedRun | Sequence[ProbedStep]) -> bool:
     """Whether two runs, or parts of them, have the same numbers; what was looked at is left out."""
-    return np.array_equal(_numbers(one), _numbers(other), equal_nan=True)
+    return np.array_equal(_all_numbers(one), _all_numbers(other), equal_nan=True)
 
 
-def _numbers(part: Run | Sequence[Sample]) -> list[float]:
-    if isinstance(part, Run):
-        return [*part.states, *part.outputs, *_numbers(part.samples)]
-    return [value for sample in part for value in (*sample.states, *sample.outputs)]
+def _all_numbers(part: ProbedRun | Sequence[ProbedStep]) -> list[float]:
+    if isinstance(part, ProbedRun):
+        return [*part.states, *part.outputs, *_all_numbers(part.samples)]
+    values: list[float] = []
+    for sample in part:
+        values += [*sample.states, *sample.outputs]
+    return values
 
 
 GENTLE = 0.02
@@ -342,10 +422,10 @@ class Point(NamedTuple):
     """
 
     k: int
-    before: Sample
-    after: Sample
-    half: Sample
-    short: tuple[Sample, ...]
+    before: ProbedStep
+    after: ProbedStep
+    half: ProbedStep
+    short: tuple[ProbedStep, ...]
 
     def moves(self) -> bool:
         """Whether half a step ends in another state than a whole one."""
@@ -357,46 +437,64 @@ class Point(NamedTuple):
         An output that the step computes from the input is: it jumps, for one input at least. None
         where nothing moves: neither the output in a step, nor anything in a short one.
         """
-        before, after = self.before.outputs[i], self.after.outputs[i]
-        made = any(
-            sample.states != self.before.states or sample.outputs[i] != before
-            for sample in self.short
-        )
-        if not made:
-            return None if after == before else False
+        before = self.before.outputs[i]
+        after = self.after.outputs[i]
         reach = HARDLY * abs(after - before)
-        return all(abs(sample.outputs[i] - before) <= reach for sample in self.short)
+        anything_moves = False
+        jumps = False
+        for sample in self.short:
+            moved = sample.outputs[i] - before
+            if sample.states != self.before.states or moved != 0:
+                anything_moves = True
+            # Written so that no number is a jump, too.
+            if not abs(moved) <= reach:
+                jumps = True
+        if not anything_moves:
+            return None if after == before else False
+        return not jumps
 
 
-def _kind_of(i: int, points: Sequence[Point], acts: bool, starts_alike: bool) -> Kind:
+def _kind_of(
+    i: int,
+    points: Sequence[Point],
+    acts: bool,
+    starts_alike: bool,
+) -> OutputKind:
     """Where output i belongs, of one that changes and does not follow a set.
 
     `acts` says that it depends on the action of the same step, `starts_alike` that its value after
     the initialisation repeats.
     """
     if any(point.after.outputs[i] != point.half.outputs[i] for point in points):
-        shown = {point.is_continuous(i) for point in points} - {None}
-        return Kind.INSTANT if shown == {True} and starts_alike else Kind.END
+        # It depends on how long the step was: it belongs to the end, or is continuous in time.
+        continuous = {point.is_continuous(i) for point in points} - {None}
+        if continuous == {True} and starts_alike:
+            return OutputKind.INSTANT
+        return OutputKind.END
     for point in points:
+        # The step moved the state, and the output is another one after it, or by the action.
         changed = point.after.outputs[i] != point.before.outputs[i]
         if point.moves() and (changed or (acts and point.k == 0)):
-            return Kind.SAMPLE
-    return Kind.OPEN
+            return OutputKind.SAMPLE
+    return OutputKind.OPEN
 
 
 class Findings(NamedTuple):
     """What `Probe` finds out before a plant runs.
 
-    `kinds` (p,) say where each output belongs; `harmless` whether a get after a set leaves what
-    follows as it is, None where that is not known. `misset` are the start values that the FMU has
-    not as asked: name, value asked for, value had. `keeps_to_step` is false where a step goes
-    equally far however long it is told to be. `failure` is what the FMU said if it failed
-    meanwhile, else empty.
+    Attributes:
+        experiment: what the FMU has to be given.
+        restart: how a second episode begins.
+        kinds: where each output belongs, (1+p,).
+        harmless: whether a get after a set leaves what follows as it is; None: not known.
+        misset: start values that the FMU has not as asked: name, value asked for, value had.
+        keeps_to_step: false where a step goes equally far however long it is asked to be.
+        failure: what the FMU said if it failed meanwhile, else empty.
     """
 
     experiment: Experiment
     restart: Restart
-    kinds: tuple[Kind, ...]
+    kinds: tuple[OutputKind, ...]
     harmless: bool | None
     misset: tuple[tuple[str, float, float], ...]
     keeps_to_step: bool
@@ -412,29 +510,35 @@ class Probe:
 
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
-        self._open = (Kind.OPEN,) * len(subject.names[1])
+        self._open = (OutputKind.OPEN,) * len(subject.names[1])
         self._vary_inputs(1.0)
 
     def _vary_inputs(self, share: float) -> None:
         """Choose the inputs of the runs; real ones vary by a share of their distance."""
-        low, high = self.subject.low, list(self.subject.high)
+        low = self.subject.low
+        high = list(self.subject.high)
         for i, place in enumerate(self.subject.exchanged[0]):
             if place.type in REALS:
                 high[i] = low[i] + share * (high[i] - low[i])
-        self._low, self._high = low, tuple(high)
+        self._low = low
+        self._high = tuple(high)
+        # Changes at most steps, and one input twice: an output that follows changes with it.
         self._inputs = (self._high, low, self._high, low, low, self._high)
+        # Another first input.
         self._other_inputs = (low, low, low, low, low, low)
+        # Another third input.
         self._late_inputs = (self._high, low, low)
 
     @cached_property
     def findings(self) -> Findings:
         """When outputs are read, how an episode begins, what the FMU is told."""
-        attempts = [self.subject.experiment]
-        default = number(
-            getattr(self.subject.fmu.description.defaultExperiment, "stopTime", None), np.inf
-        )
-        if attempts[0].stop_time is None and np.isfinite(default):
-            attempts.append(attempts[0]._replace(stop_time=default))
+        asked = self.subject.experiment
+        attempts = [asked]
+        # Some FMUs do not run without a stop time.
+        default = self.subject.fmu.description.defaultExperiment
+        stop_time = number(getattr(default, "stopTime", None), np.inf)
+        if asked.stop_time is None and np.isfinite(stop_time):
+            attempts.append(asked._replace(stop_time=stop_time))
         failures = []
         # An FMU may not bear what a controller would not do; nearer to the reference it may.
         for share, attempt in product((1.0, GENTLE), attempts):
@@ -451,11 +555,28 @@ class Probe:
             finally:
                 bench.close()
         # It fails at once: the plant will say so when it is used.
-        return Findings(attempts[0], Restart.FRESH, self._open, None, (), True, failures[0])
+        return self._nothing_known(asked)._replace(failure=failures[0])
 
-    def _examine(self, bench: _Bench, first: Run, experiment: Experiment) -> Findings:
+    def _nothing_known(self, experiment: Experiment) -> Findings:
+        return Findings(
+            experiment=experiment,
+            restart=Restart.FRESH,
+            kinds=self._open,
+            harmless=None,
+            misset=(),
+            keeps_to_step=True,
+            failure="",
+        )
+
+    def _examine(
+        self,
+        bench: _Bench,
+        first: ProbedRun,
+        experiment: Experiment,
+    ) -> Findings:
         """What the runs after a first one show; the first failure ends it."""
-        seen = Findings(experiment, Restart.FRESH, self._open, None, (), True, "")
+        seen = self._nothing_known(experiment)
+        # A reset must repeat the first run to the bit, before any other run relies on it.
         try:
             bench.resets = _same(bench.run(self._inputs, by_reset=True), first)
         except PlantError as error:
@@ -467,9 +588,11 @@ class Probe:
             else:
                 second = bench.run(self._inputs, by_reset=False)
                 starts_alike = second.outputs == first.outputs
+                # Noise that no seed holds: runs that differ in one thing say nothing.
                 if not _same(second.samples, first.samples):
                     line = "two new instances under the same actions give different numbers"
                     return seen._replace(failure=seen.failure or line)
+            # FMI forbids it: an FMU may answer, and go on otherwise than it would have.
             looked = bench.run(self._inputs, look=True).samples
             seen = seen._replace(harmless=_same(looked, first.samples))
             kinds = self._kinds(bench, first, looked if seen.harmless else (), starts_alike)
@@ -480,13 +603,14 @@ class Probe:
         except PlantError as error:
             return seen._replace(failure=str(error))
 
-    def _keeps_to_step(self, bench: _Bench, first: Run) -> bool:
+    def _keeps_to_step(self, bench: _Bench, first: ProbedRun) -> bool:
         """Whether half a step ends elsewhere than a whole one, or two halves where it does.
 
         A sampled plant, which moves at the begin of a sample and rests till the next, does the
         latter; one that goes by a step of its own, whatever it is told, neither.
         """
         half = self.subject.step / 2
+        # An FMU that refuses half a step knows how long a step is.
         try:
             halves = bench.run(self._inputs[:1] * 2, sizes=[half, half], spacing=half).samples
         except PlantError:
@@ -496,72 +620,89 @@ class Probe:
         return halves[0].states != whole or halves[1].states == whole
 
     def _misset(self, bench: _Bench) -> tuple[tuple[str, float, float], ...]:
-        asked = [value for _, value in self.subject.starts]
         present = bench.start().read_starts()
-        rows = zip(self.subject.start_names, asked, present, strict=False)
-        return tuple(row for row in rows if not as_asked(*row[1:]))
+        rows = []
+        for i, name in enumerate(self.subject.start_names):
+            asked = self.subject.starts[i][1]
+            if not as_asked(asked, present[i]):
+                rows.append((name, asked, present[i]))
+        return tuple(rows)
 
     def _kinds(
-        self, bench: _Bench, first: Run, looked: Sequence[Sample], starts_alike: bool
-    ) -> tuple[Kind, ...]:
+        self,
+        bench: _Bench,
+        first: ProbedRun,
+        looked: Sequence[ProbedStep],
+        starts_alike: bool,
+    ) -> tuple[OutputKind, ...]:
         """Where each output belongs, by runs that differ in one thing.
 
         `looked` are the samples of `first` with a look after each set, if that is harmless.
         """
+        n_outputs = len(self.subject.names[1])
         other = bench.run(self._other_inputs[:1], look=bool(looked))
-        follows = [False] * len(self.subject.names[1])
+        follows = [False] * n_outputs
         if looked:
             late = bench.run(self._late_inputs, look=True)
-            for i in range(len(follows)):
-                at_once = looked[0].looked[i] != other.samples[0].looked[i]
-                follows[i] = at_once and looked[2].looked[i] != late.samples[2].looked[i]
+            for i in range(n_outputs):
+                # It follows where it does so at the first sample and at a later one.
+                at_first = looked[0].looked[i] != other.samples[0].looked[i]
+                follows[i] = at_first and looked[2].looked[i] != late.samples[2].looked[i]
         points = [self._point(bench, first, 0)]
         if self.subject.fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
             points.append(self._point(bench, first, 2))
+        known_points = [point for point in points if point is not None]
         kinds = []
         for i, place in enumerate(self.subject.exchanged[1]):
             acts = first.samples[0].outputs[i] != other.samples[0].outputs[i]
-            changes = {first.outputs[i]} != {sample.outputs[i] for sample in first.samples}
+            values = {sample.outputs[i] for sample in first.samples}
+            changes = values != {first.outputs[i]}
             if place in self.subject.exchanged[2]:
-                kinds.append(Kind.INSTANT)
+                kinds.append(OutputKind.INSTANT)
             elif follows[i]:
-                kinds.append(Kind.FOLLOWS)
+                kinds.append(OutputKind.FOLLOWS)
             elif not (acts or changes):
-                kinds.append(Kind.CONSTANT)
+                kinds.append(OutputKind.CONSTANT)
             else:
-                made = [point for point in points if point is not None]
-                kinds.append(_kind_of(i, made, acts, starts_alike))
+                kinds.append(_kind_of(i, known_points, acts, starts_alike))
         return tuple(kinds)
 
-    def _point(self, bench: _Bench, first: Run, k: int) -> Point | None:
+    def _point(
+        self,
+        bench: _Bench,
+        first: ProbedRun,
+        k: int,
+    ) -> Point | None:
         """Steps of other lengths from sample k on; None where the FMU refuses them."""
         step = self.subject.step
-        before = first.samples[k - 1] if k else Sample((), first.states, first.outputs)
+        before = first.samples[k - 1] if k else ProbedStep((), first.states, first.outputs)
+
+        def under(values: tuple[float, ...], size: float) -> ProbedStep:
+            inputs = (*self._inputs[:k], values)
+            sizes = [step] * k + [size]
+            return bench.run(inputs, sizes=sizes).samples[k]
+
         try:
-            other, *short = (
-                bench.run((*self._inputs[:k], values), sizes=[step] * k + [size]).samples[k]
-                for values, size in (
-                    (self._inputs[k], step / 2),
-                    (self._low, step * SHORT),
-                    (self._high, step * SHORT),
-                )
-            )
+            half = under(self._inputs[k], step / 2)
+            short = (under(self._low, step * SHORT), under(self._high, step * SHORT))
         except PlantError:
             bench.instantiate()
             return None
-        return Point(k, before, first.samples[k], other, tuple(short))
+        return Point(k, before, first.samples[k], half, short)
 
     @cached_property
     def reading(self) -> Reading:
         """The order of a step's calls that gives each output where it belongs."""
         kinds = self.findings.kinds
-        if Kind.FOLLOWS in kinds:
+        # What follows the actions needs a get between set and step, what is of state or time one
+        # before both; the late ones are read once more after the step.
+        if OutputKind.FOLLOWS in kinds:
             order = Order.SET_GET_STEP
-        elif Kind.INSTANT in kinds:
+        elif OutputKind.INSTANT in kinds:
             order = Order.GET_SET_STEP
         else:
             return Reading(Order.SET_STEP_GET)
-        late = tuple(i for i, kind in enumerate(kinds) if kind in (*AFTER, Kind.OPEN))
+        late = tuple(i for i, kind in enumerate(kinds) if kind in (*AFTER, OutputKind.OPEN))
         return Reading(order, late)
 
     @property
@@ -574,43 +715,45 @@ class Probe:
 
     def stated(self, outputs: str) -> Reading:
         """The reading for a value of `plant.outputs`; raises PlantError where it was seen wrong."""
-        wrong = AFTER if outputs == "before-step" else BEFORE
         kinds = self.findings.kinds
-        seen = next(
-            (
-                f"output '{name}' {kind.value}"
-                for name, kind in zip(self.subject.names[1], kinds, strict=True)
-                if kind in wrong
-            ),
-            "",
-        )
-        if not seen and outputs == "before-step" and self.findings.harmless is False:
-            seen = "a get after a set changes what follows"
-        if seen:
+        wrong = AFTER if outputs == "before-step" else BEFORE
+        fault = ""
+        for name, kind in zip(self.subject.names[1], kinds, strict=True):
+            if kind in wrong:
+                fault = f"output '{name}' {kind.value}"
+                break
+        if not fault and outputs == "before-step" and self.findings.harmless is False:
+            fault = "a get after a set changes what follows"
+        if fault:
             cure = f'set it to "{self.outputs}"' if self.outputs else "leave it out"
             raise PlantError(
                 f'plant.outputs = "{outputs}" does not fit FMU '
-                f"'{self.subject.fmu.path.name}': {seen}; {cure}"
+                f"'{self.subject.fmu.path.name}': {fault}; {cure}"
             )
         if outputs == "after-step":
             return Reading(Order.SET_STEP_GET)
-        instant = Kind.INSTANT in kinds and Kind.FOLLOWS not in kinds
-        return Reading(Order.GET_SET_STEP if instant else Order.SET_GET_STEP)
+        # Outputs that no action moves at once need no set before them, which FMI forbids.
+        if OutputKind.INSTANT in kinds and OutputKind.FOLLOWS not in kinds:
+            return Reading(Order.GET_SET_STEP)
+        return Reading(Order.SET_GET_STEP)
 
     @property
     def misfit(self) -> str:
         """Why the FMU cannot be the plant as asked; empty if it can."""
-        findings, name = self.findings, f"FMU '{self.subject.fmu.path.name}'"
+        findings = self.findings
+        name = f"FMU '{self.subject.fmu.path.name}'"
+        # The first of them: others may follow from it.
         for start, asked, value in findings.misset:
             return (
                 f"{name} was given {start} = {asked:g} and has {value:g} after its initialisation"
             )
         default = self.subject.fmu.description.defaultExperiment
-        step, own = self.subject.step, float(getattr(default, "stepSize", None) or 0.0)
-        if not findings.keeps_to_step and own and abs(step - own) > 1e-9 * own:
+        step = self.subject.step
+        fixed = float(getattr(default, "stepSize", None) or 0.0)
+        if not findings.keeps_to_step and fixed and abs(step - fixed) > 1e-9 * fixed:
             return (
                 f"{name} goes equally far however long a step is told to be, and its own step is "
-                f"{own:g} s by its default experiment, not {step:g} s: set sampling_time or "
+                f"{fixed:g} s by its default experiment, not {step:g} s: set sampling_time or "
                 "plant.communication_step to it"
             )
         return ""
@@ -618,7 +761,7 @@ class Probe:
     @property
     def cost_of_sample(self) -> bool:
         """Whether the stage cost is that of the sample's begin, ℓ(x_k, u_k, d_k), or may be."""
-        return self.findings.kinds[0] is not Kind.END
+        return self.findings.kinds[0] is not OutputKind.END
 
     @cached_property
     def snapshots(self) -> str:
@@ -640,10 +783,11 @@ class Probe:
         finally:
             bench.close()
 
-    def _saved(self, bench: _Bench) -> tuple[Instance, tuple[float, ...], tuple[Sample, ...]]:
+    def _saved(self, bench: _Bench) -> tuple[Instance, tuple[float, ...], tuple[ProbedStep, ...]]:
         """Save after the first sample; the states then, and what followed."""
         fmi = bench.start()
         fmi.require_state()
+        # From here on it may be taken back.
         fmi.no_return.value = False
         bench.go_on(fmi, self._inputs[:1])
         states = tuple(fmi.states)
@@ -651,6 +795,7 @@ class Probe:
         return fmi, states, bench.go_on(fmi, self._inputs[1:], first=1)
 
     def _try_snapshot(self, bench: _Bench) -> str:
+        # What the same steps give where nothing is saved.
         without = bench.run(self._inputs)
         fmi, states, samples = self._saved(bench)
         if not _same(samples, without.samples[1:]):
@@ -678,13 +823,15 @@ class Probe:
         bench = _Bench(self.subject, self.findings.experiment)
         try:
             bench.instantiate()
+            # All actions low, then one of them high.
             rest = bench.run(self._other_inputs).samples
             names = {}
             for i, name in enumerate(self.subject.names[0]):
                 moved = list(self._low)
                 moved[i] = self._high[i]
                 samples = bench.run([tuple(moved)] * len(rest)).samples
-                if [sample.states for sample in samples] == [sample.states for sample in rest]:
+                states = [sample.states for sample in samples]
+                if states == [sample.states for sample in rest]:
                     names[name] = not _same(samples, rest)
             return names
         except PlantError:
@@ -694,10 +841,12 @@ class Probe:
 
 
 _probes: dict[tuple[Any, ...], Probe] = {}
+"""Probes of this process by what their findings hold for."""
 
 
 def probe_of(subject: Subject) -> Probe:
     """The one probe of a subject in this process."""
+    # To try an FMU takes a dozen short runs; a study makes hundreds of plants of it.
     key = subject.key
     if key not in _probes:
         _probes[key] = Probe(subject)
@@ -734,24 +883,32 @@ def probe(
     else:
         fmu = unpack(plant)
         subject = bare_subject(fmu, actions, outputs, states, step)
-        starts_anywhere = all(
-            has_start(fmu.variable(name)) or f"{name}_start" in fmu.variables
-            for name in subject.names[2]
-        )
+        # By name alone: `start_parameters` proves it, and needs a scenario.
+        starts_anywhere = True
+        for name in subject.names[2]:
+            if not has_start(fmu.variable(name)) and f"{name}_start" not in fmu.variables:
+                starts_anywhere = False
     return _report(probe_of(subject), starts_anywhere)
 
 
+def _undriven_inputs(subject: Subject) -> dict[str, str]:
+    """Start values of the inputs that nobody sets, by name."""
+    places = {(place.reference, place.type, place.element) for place, _ in subject.starts}
+    undriven = {}
+    for variable in subject.fmu.description.modelVariables:
+        if variable.causality != "input" or variable.name in subject.names[0]:
+            continue
+        if (int(variable.valueReference), str(variable.type), 0) not in places:
+            undriven[variable.name] = str(variable.start or "")
+    return undriven
+
+
 def _report(seen: Probe, starts_anywhere: bool) -> Report:
-    subject, findings = seen.subject, seen.findings
-    fmu, kinds = subject.fmu, dict(zip(subject.names[1], findings.kinds, strict=True))
-    given = {place[:3] for place, _ in subject.starts}
-    undriven = {
-        v.name: str(v.start or "")
-        for v in fmu.description.modelVariables
-        if v.causality == "input"
-        and v.name not in subject.names[0]
-        and (int(v.valueReference), str(v.type), 0) not in given
-    }
+    subject = seen.subject
+    findings = seen.findings
+    fmu = subject.fmu
+    kinds = dict(zip(subject.names[1], findings.kinds, strict=True))
+    undriven = _undriven_inputs(subject)
     rows = [
         _outputs_row(seen, kinds),
         _restart_row(findings),
@@ -796,14 +953,14 @@ def _report(seen: Probe, starts_anywhere: bool) -> Report:
     )
 
 
-def _outputs_row(seen: Probe, kinds: dict[str, Kind]) -> Row:
+def _outputs_row(seen: Probe, kinds: dict[str, OutputKind]) -> Row:
     said = "; ".join(f"{name} {kind.value}" for name, kind in kinds.items())
     if seen.outputs is None:
         return Row("outputs", said, "each is read where it belongs; leave plant.outputs out")
     order = f'plant.outputs = "{seen.outputs}"'
     if not set(kinds.values()) & {*BEFORE, *AFTER}:
         order += ", the order that FMI allows, without proof"
-    if Kind.END in kinds.values():
+    if OutputKind.END in kinds.values():
         order += "; figures that need the cost at the sample's begin are refused"
     return Row("outputs", said, order)
 
@@ -824,7 +981,11 @@ def _still_row(still: dict[str, bool]) -> Row:
     return Row("actions that move no state", names or "none", consequence if still else "")
 
 
-def _ability_row(subject: str, fault: str, use: str) -> Row:
+def _ability_row(
+    subject: str,
+    fault: str,
+    use: str,
+) -> Row:
     return Row(subject, fault or "gives the same steps again", "not used" if fault else use)
 
 

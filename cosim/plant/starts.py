@@ -37,18 +37,17 @@ def start_parameters(scenario: Scenario, fmu: UnpackedFmu) -> dict[str, str]:
     states = scenario.plant.states
     initial = dict(zip(states, _initial_states(scenario, fmu, {}, ()), strict=True))
     parameters: dict[str, str] = {}
+    values: dict[str, float] = {}
     for state in states:
         for candidate in candidates(fmu, state):
+            # One that sets another state's start already.
             if candidate in parameters.values():
                 continue
             value = _moved(fmu, state, candidate, initial[state])
             if _starts_at(scenario, fmu, {state: candidate}, {state: value}):
                 parameters[state] = candidate
+                values[state] = value
                 break
-    values = {
-        state: _moved(fmu, state, parameter, initial[state])
-        for state, parameter in parameters.items()
-    }
     # One parameter may move another state as well: all of them together must do as asked.
     if len(parameters) > 1 and not _starts_at(scenario, fmu, parameters, values):
         return {}
@@ -60,21 +59,26 @@ def candidates(fmu: UnpackedFmu, state: str) -> Iterator[str]:
 
     The start of `reactor.medium.T[2]` may be `reactor.medium.T_start[2]`, `reactor.T_start[2]`, or
     `T_start[2]`, with any of `WORDS`; last comes the state's own start value.
+
+    Args:
+        fmu: has the variables.
+        state: name of the state.
     """
     path, base, index = split_name(state)
-    settable = [
-        name
-        for name, variable in fmu.variables.items()
-        if variable.causality in ("parameter", "structuralParameter")
-        and variable.type in REALS
-        and not variable.shape
-        and name != state
-    ]
+    # Settable variables by where they stand, with their bases.
+    settable: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for name, variable in fmu.variables.items():
+        if variable.causality not in ("parameter", "structuralParameter") or name == state:
+            continue
+        if variable.type in REALS and not variable.shape:
+            other_path, other_base, other_index = split_name(name)
+            settable.setdefault((other_path, other_index), []).append((name, other_base))
+    # From the state's own component outwards.
     while True:
+        beside = settable.get((path, index), [])
         for word in WORDS:
-            for name in settable:
-                other_path, other_base, other_index = split_name(name)
-                if (other_path, other_index) == (path, index) and _is(other_base, base, word):
+            for name, other_base in beside:
+                if _has_word(other_base, base, word):
                     yield name
         if not path:
             break
@@ -91,44 +95,62 @@ def split_name(name: str) -> tuple[str, str, str]:
     """
     pieces = re.findall(r"'[^']*'|\[[^\]]*\]|\.|[^.'\[]+|.", name)
     last_dot = max((i for i, piece in enumerate(pieces) if piece == "."), default=-1)
-    path, rest = "".join(pieces[: last_dot + 1]), pieces[last_dot + 1 :]
+    path = "".join(pieces[: last_dot + 1])
+    rest = pieces[last_dot + 1 :]
+    # A name may begin with a bracket.
     index = rest.pop() if len(rest) > 1 and rest[-1].startswith("[") else ""
     return path, "".join(rest), index
 
 
-def _is(name: str, base: str, word: str) -> bool:
+def _has_word(
+    name: str,
+    base: str,
+    word: str,
+) -> bool:
     """Whether a name is the base with the word added: `T_start`, `TStart`, `startT`, `start_T`."""
-    plain, stem = name.replace("_", "").lower(), base.replace("_", "").lower()
+    plain = name.replace("_", "").lower()
+    stem = base.replace("_", "").lower()
     if plain == stem + word:
         return True
     return plain == word + stem and word.isalpha()
 
 
 def _starting_by(
-    scenario: Scenario, parameters: dict[str, str], values: Sequence[float]
+    scenario: Scenario,
+    parameters: dict[str, str],
+    values: Sequence[float],
 ) -> Scenario:
     """The scenario with these states alone, or with all of them and no start to be set."""
     plant = scenario.plant
-    keep = [i for i, name in enumerate(plant.states) if not parameters or name in parameters]
+    kept = [i for i, name in enumerate(plant.states) if not parameters or name in parameters]
     document = scenario.to_dict()
-    for table, fields in {
-        "plant": ("states", "initial_state"),
-        "bounds": ("state_lower", "state_upper"),
-        "penalty": ("linear", "quadratic"),
-        "controller": ("reference_state",),
-    }.items():
-        for field in fields:
-            document[table][field] = [document[table][field][i] for i in keep]
+    # Every list with an entry for each state.
+    for table, field in (
+        ("plant", "states"),
+        ("plant", "initial_state"),
+        ("bounds", "state_lower"),
+        ("bounds", "state_upper"),
+        ("penalty", "linear"),
+        ("penalty", "quadratic"),
+        ("controller", "reference_state"),
+    ):
+        entries = document[table][field]
+        document[table][field] = [entries[i] for i in kept]
+    names = []
     if parameters:
         document["plant"]["initial_state"] = list(values)
-    names = [parameters[plant.states[i]] for i in keep] if parameters else []
-    document["plant"] |= {"mapping": {"initial_state": names}, "disturbances": []}
+        names = [parameters[plant.states[i]] for i in kept]
+    document["plant"]["mapping"] = {"initial_state": names}
+    document["plant"]["disturbances"] = []
     document["disturbance"] = {"law": "none"}
     return Scenario.from_dict(document)
 
 
 def _initial_states(
-    scenario: Scenario, fmu: UnpackedFmu, parameters: dict[str, str], values: Sequence[float]
+    scenario: Scenario,
+    fmu: UnpackedFmu,
+    parameters: dict[str, str],
+    values: Sequence[float],
 ) -> list[float]:
     """States of a new instance whose parameters have these values, after its initialisation."""
     wiring = Wiring(_starting_by(scenario, parameters, values), fmu)
@@ -149,7 +171,10 @@ def _initial_states(
 
 
 def _starts_at(
-    scenario: Scenario, fmu: UnpackedFmu, parameters: dict[str, str], values: dict[str, float]
+    scenario: Scenario,
+    fmu: UnpackedFmu,
+    parameters: dict[str, str],
+    values: dict[str, float],
 ) -> bool:
     """Whether the FMU starts at these values of the states once the parameters have them."""
     names = [name for name in scenario.plant.states if name in parameters]
@@ -158,21 +183,34 @@ def _starts_at(
         reached = _initial_states(scenario, fmu, parameters, asked)
     except PlantError:
         return False
-    return all(
-        abs(state - value) <= AGREES * _move(fmu, name, value)
-        for name, state, value in zip(names, reached, asked, strict=True)
-    )
+    for name, state, value in zip(names, reached, asked, strict=True):
+        # Written so that no number is a miss, too.
+        if not abs(state - value) <= AGREES * _move(fmu, name, value):
+            return False
+    return True
 
 
-def _move(fmu: UnpackedFmu, state: str, value: float) -> float:
+def _move(
+    fmu: UnpackedFmu,
+    state: str,
+    value: float,
+) -> float:
+    """By how much a probe moves a state's start."""
     nominal = number(getattr(fmu.variable(state), "nominal", None), 0.0)
     return PROBED * max(abs(value), abs(nominal), 1e-3)
 
 
-def _moved(fmu: UnpackedFmu, state: str, parameter: str, initial: float) -> float:
+def _moved(
+    fmu: UnpackedFmu,
+    state: str,
+    parameter: str,
+    initial: float,
+) -> float:
     """A start beside the initial one, within the range of the state and of the parameter."""
     move = _move(fmu, state, initial)
+    state_low, state_high = fmu.range(state)
+    low, high = fmu.range(parameter)
     for value in (initial + move, initial - move):
-        if all(low <= value <= high for low, high in map(fmu.range, (state, parameter))):
+        if max(state_low, low) <= value <= min(state_high, high):
             return value
     return initial + move

@@ -24,23 +24,26 @@ from cosim.plant.fmi import (
 )
 
 REALS = ("Real", "Float64", "Float32")
+"""FMI's types of numbers that are not whole."""
+WIDE_INTEGERS = ("Int64", "UInt64")
+INTEGERS = ("Integer", "Int32", "UInt32", *WIDE_INTEGERS)
+"""Types that can take a word of the seed."""
+NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
 
 
 def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
     """Every reason for which `FmuPlant` refuses the FMU, as its error message says it.
 
-    One is a communication `step` [s] that is no multiple of a fixed internal step;
-    canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
+    Args:
+        fmu: the file.
+        step: communication step in s. One that is no multiple of a fixed internal step is a reason;
+            canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it
+            be.
     """
-    description, name = fmu.description, f"FMU '{fmu.path}'"
-    simulation = description.coSimulation
+    name = f"FMU '{fmu.path}'"
+    simulation = fmu.description.coSimulation
     if simulation is None:
-        faces = {
-            "model exchange": description.modelExchange,
-            "scheduled execution": description.scheduledExecution,
-        }
-        others = ", ".join(words for words, face in faces.items() if face is not None)
-        yield f"{name} has no co-simulation interface (it has: {others or 'none'})"
+        yield f"{name} has no co-simulation interface (it has: {_other_interfaces(fmu)})"
     else:
         try:
             library_path(fmu)
@@ -53,19 +56,24 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
                 f"{name} steps by multiples of {internal:g} s (fixedInternalStepSize), and the "
                 f"communication step of {step:g} s is none"
             )
-    numbers = [v for v in description.modelVariables if v.type not in NO_NUMBERS]
+    numbers = [v for v in fmu.description.modelVariables if v.type not in NO_NUMBERS]
     if not any(_can_act(variable) for variable in numbers):
         yield (
             f"{name} has no input and no tunable parameter that is a number: there is nothing for "
             "a controller to act on"
         )
-    if not any(v.causality in ("output", "local") for v in numbers):
+    if not any(variable.causality in ("output", "local") for variable in numbers):
         yield f"{name} has no output that is a number: there is nothing for a controller to see"
 
 
-_WIDE = ("Int64", "UInt64")
-INTEGERS = ("Integer", "Int32", "UInt32", *_WIDE)
-NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
+def _other_interfaces(fmu: UnpackedFmu) -> str:
+    """FMI's interfaces that the FMU has beside co-simulation, in words."""
+    names = []
+    if fmu.description.modelExchange is not None:
+        names.append("model exchange")
+    if fmu.description.scheduledExecution is not None:
+        names.append("scheduled execution")
+    return ", ".join(names) or "none"
 
 
 def has_start(variable: Any) -> bool:
@@ -83,9 +91,16 @@ def interface(fmu: UnpackedFmu) -> type[Fmi2Instance] | type[Fmi3Instance]:
 
 
 def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
-    """What an FMU is told of the simulation: what a scenario states, else its own default.
+    """Start time, stop time and tolerance that an FMU gets: the scenario's, else its own defaults.
 
     A default stop time is left out: a run may well go on beyond it.
+
+    Args:
+        fmu: has the defaults.
+        plant: the scenario's table; None: the defaults alone.
+
+    Raises:
+        PlantError: the stop time is not after the start time.
     """
     default = fmu.description.defaultExperiment
     start = number(getattr(default, "startTime", None), 0.0)
@@ -94,6 +109,7 @@ def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
         return Experiment(start, None, tolerance)
     if plant.start_time is not None:
         start = plant.start_time
+    # Only here both are known: either may be the file's.
     if plant.stop_time is not None and plant.stop_time <= start:
         raise PlantError(
             f"plant.stop_time of {plant.stop_time:g} s is not after the start time of {start:g} s, "
@@ -103,67 +119,100 @@ def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
 
 
 class Wiring:
-    """Places in an FMU of the variables that a scenario names; raises PlantError on any misfit.
+    """Places in an FMU of the variables that a scenario names.
 
-    They are `inputs`, `outputs` (stage cost first), `states`, the `seeds`, low word first, the
-    parameters for the `initial` state, and all `starts` with their values.
+    Args:
+        scenario: names the variables.
+        fmu: has them.
+
+    Attributes:
+        inputs, states: places of the actions and states.
+        outputs: places of the stage cost, which is the first, and the disturbances.
+        seeds: places of the seed's words, low word first.
+        initial: places of the parameters for the initial state.
+        starts: places and values of all start values.
+
+    Raises:
+        PlantError: a variable is not there, or of no use for what it is named for.
     """
 
     def __init__(self, scenario: Scenario, fmu: UnpackedFmu) -> None:
-        self._scenario, self._fmu, plant = scenario, fmu, scenario.plant
+        plant = scenario.plant
+        mapping = plant.mapping
+        self._scenario = scenario
+        self._fmu = fmu
         self.interface = interface(fmu)
         self.experiment = experiment(fmu, plant)
-        self.outputs = self._numbers((plant.stage_cost, *plant.disturbances), "plant")
-        self.states = self._numbers(plant.states, "plant.states")
-        self.initial = self._numbers(plant.mapping.initial_state, "plant.mapping.initial_state")
+        self.outputs = self._number_places((plant.stage_cost, *plant.disturbances), "plant")
+        self.states = self._number_places(plant.states, "plant.states")
+        self.initial = self._number_places(mapping.initial_state, "plant.mapping.initial_state")
         self.seeds: list[Place] = []
-        for name in plant.mapping.seed:
-            if not (self.seeds and self.seeds[-1].type in _WIDE):
+        for name in mapping.seed:
+            # One of 64 bits takes both words.
+            if not (self.seeds and self.seeds[-1].type in WIDE_INTEGERS):
                 self.seeds.append(self._place(name, "plant.mapping.seed", _no_word))
         self.start_names: list[str] = []
-        self.starts = self._starts()
+        self.starts = self._start_places()
         self._require_whole_arrays([place for place, _ in self.starts])
         self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
         self._require_whole_arrays(self.inputs)
 
     def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
-        """By the number of a sample the places to write at its start, and the values."""
+        """Places to write at the start of a sample, and the values, by the sample's number."""
         scenario = self._scenario
-        found: dict[int, tuple[list[Place], list[float]]] = {}
+        changes: dict[int, tuple[list[Place], list[float]]] = {}
         for change in scenario.plant.changes or ():
-            places, values = found.setdefault(ceil(change.time / scenario.sampling_time), ([], []))
+            # At the first sample that begins at its time or later.
+            sample = ceil(change.time / scenario.sampling_time)
+            places, values = changes.setdefault(sample, ([], []))
             for name, value in change.parameters.items():
                 places.append(self._place(name, "plant.changes", _not_written))
                 values.append(value)
-        for places, _ in found.values():
+        for places, _ in changes.values():
             self._require_whole_arrays(places)
-        return found
+        return changes
 
-    def _numbers(self, names: Sequence[str], table: str) -> list[Place]:
+    def _number_places(self, names: Sequence[str], table: str) -> list[Place]:
         return [self._place(name, table, _no_number) for name in names]
 
-    def _starts(self) -> list[tuple[Place, float]]:
-        scenario, mapping = self._scenario, self._scenario.plant.mapping
-        law, codes = scenario.disturbance, mapping.law_codes
-        fields: dict[str, tuple[str | Sequence[str] | None, Sequence[float]]] = {
-            "initial_state": (mapping.initial_state, scenario.plant.initial_state),
-            "sampling_time": (mapping.sampling_time, [scenario.sampling_time]),
-            "stochastic": (mapping.stochastic, [float(law.law != "none")]),
-            "law": (mapping.law, [codes[law.law]] if law.law in codes else []),
-            "nominal": (mapping.nominal, law.nominal),
-            "ranges": (mapping.ranges, law.ranges),
-        }
-        starts = []
-        for field, (names, values) in fields.items():
+    def _start_places(self) -> list[tuple[Place, float]]:
+        """Places and values of all that the scenario sets before an episode, the seed as 0."""
+        scenario = self._scenario
+        plant = scenario.plant
+        mapping = plant.mapping
+        law = scenario.disturbance
+        codes = [mapping.law_codes[law.law]] if law.law in mapping.law_codes else []
+        stochastic = float(law.law != "none")
+        starts: list[tuple[Place, float]] = []
+
+        def add(
+            field: str,
+            names: str | Sequence[str] | None,
+            values: Sequence[float],
+        ) -> None:
             listed = [names] if isinstance(names, str) else names or ()
             # Either may be left out; the scenario has checked that they fit.
             for name, value in zip(listed, values, strict=False):
-                starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
-        for name, value in scenario.plant.parameters.items():
-            starts.append(self._start_value(name, float(value), "plant.parameters"))
-        return starts + [(place, 0.0) for place in self.seeds]
+                starts.append(self._start_value(name, float(value), field))
 
-    def _start_value(self, name: str, value: float, table: str) -> tuple[Place, float]:
+        add("plant.mapping.initial_state", mapping.initial_state, plant.initial_state)
+        add("plant.mapping.sampling_time", mapping.sampling_time, [scenario.sampling_time])
+        add("plant.mapping.stochastic", mapping.stochastic, [stochastic])
+        add("plant.mapping.law", mapping.law, codes)
+        add("plant.mapping.nominal", mapping.nominal, law.nominal)
+        add("plant.mapping.ranges", mapping.ranges, law.ranges)
+        for name, value in plant.parameters.items():
+            add("plant.parameters", name, [value])
+        for place in self.seeds:
+            starts.append((place, 0.0))
+        return starts
+
+    def _start_value(
+        self,
+        name: str,
+        value: float,
+        table: str,
+    ) -> tuple[Place, float]:
         def misfit(variable: Any) -> str:
             if variable.type not in self.interface.setters:
                 return f"is {_a(variable.type)}, which cannot be set here"
@@ -176,51 +225,73 @@ class Wiring:
         self.start_names.append(name)
         return self._place(name, table, misfit), value
 
-    def _place(self, name: str, table: str, misfit: Callable[[Any], str]) -> Place:
+    def _place(
+        self,
+        name: str,
+        table: str,
+        misfit: Callable[[Any], str],
+    ) -> Place:
         """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is.
 
         `misfit` says what is wrong with a variable, if anything.
         """
-        fmu, asked = self._fmu, f"{table} of scenario '{self._scenario.name}' names"
-        if (variable := fmu.variable(name)) is None:
+        fmu = self._fmu
+        asked = f"{table} of scenario '{self._scenario.name}' names"
+        variable = fmu.variable(name)
+        if variable is None:
             raise PlantError(
                 f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}, "
                 f"which {asked}"
             )
-        what, shape, index = misfit(variable), self._shape(variable), 0
-        if shape and not what:
+        shape = self._shape(variable)
+        index = 0
+        # The kind first: of a wrong variable no element helps.
+        fault = misfit(variable)
+        if shape and not fault:
+            brackets = name.removeprefix(variable.name)
             try:
-                indices = name.removeprefix(variable.name).removeprefix("[").removesuffix("]")
-                index = int(np.ravel_multi_index([int(i) for i in indices.split(",")], shape))
+                indices = brackets.removeprefix("[").removesuffix("]").split(",")
+                index = int(np.ravel_multi_index([int(i) for i in indices], shape))
             except ValueError:
-                last = ",".join(str(n - 1) for n in shape)
-                what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
-        if what:
-            raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
-        structural = variable.causality == "structuralParameter"
-        starts = _start_values(variable, prod(shape)) or (nan,) * prod(shape)
-        reference = int(variable.valueReference)
-        return Place(reference, str(variable.type), index, starts, structural)
+                last = ",".join(str(size - 1) for size in shape)
+                fault = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
+        if fault:
+            raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {fault}; {asked} it")
+        size = prod(shape)
+        return Place(
+            int(variable.valueReference),
+            str(variable.type),
+            index,
+            _start_values(variable, size) or (nan,) * size,
+            variable.causality == "structuralParameter",
+        )
 
     def _require_whole_arrays(self, places: Sequence[Place]) -> None:
         """Raise PlantError where an array whose start values are not known is set in part."""
+        # FMI sets an array as a whole, so that the elements nobody names need a value.
         unknown = [place for place in places if any(map(isnan, place.starts))]
         for place in unknown:
-            named = {other.element for other in unknown if other[:2] == place[:2]}
-            if len(named) < len(place.starts):
-                name = next(
-                    variable.name
-                    for variable in self._fmu.variables.values()
-                    if (variable.valueReference, variable.type) == place[:2]
-                )
-                raise PlantError(
-                    f"array '{name}' of FMU '{self._fmu.path.name}' has {len(place.starts)} "
-                    "elements by plant.parameters, for which its description states no start "
-                    f"values: scenario '{self._scenario.name}' must name each where it names one"
-                )
+            array = (place.reference, place.type)
+            named = {other.element for other in unknown if (other.reference, other.type) == array}
+            if len(named) == len(place.starts):
+                continue
+            raise PlantError(
+                f"array '{self._name_of(place)}' of FMU '{self._fmu.path.name}' has "
+                f"{len(place.starts)} elements by plant.parameters, for which its description "
+                f"states no start values: scenario '{self._scenario.name}' must name each where "
+                "it names one"
+            )
+
+    def _name_of(self, place: Place) -> str:
+        """Name of the variable at a place."""
+        for variable in self._fmu.variables.values():
+            if (variable.valueReference, variable.type) == (place.reference, place.type):
+                return str(variable.name)
+        raise AssertionError(place)
 
     def _shape(self, variable: Any) -> tuple[int, ...]:
         """Shape of a variable, by the structural parameters as the scenario sets them."""
+        # FMI 3.0: a dimension may be a parameter, which the scenario may set.
         parameters = self._scenario.plant.parameters
         shape = []
         for dimension in variable.dimensions:
@@ -238,7 +309,8 @@ def _start_values(variable: Any, size: int) -> tuple[float, ...] | None:
     That is so where a structural parameter gives an array another size.
     """
     stated = ["0"] if variable.type in NO_NUMBERS else str(variable.start or 0).split()
-    if size == 1:  # its name gives all of it
+    if size == 1:
+        # Its name gives all of it.
         stated = stated[:1]
     elif len(stated) == 1:
         stated *= size
@@ -273,9 +345,14 @@ def _a(noun: str) -> str:
 
 
 def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
-    """A seed's words for the `places` of `Wiring.seeds`, each with its own.
+    """A seed in words, low word first, each with its place.
 
-    Raises PlantError for anything but an integer in [0, 2⁶⁴).
+    Args:
+        seed: in [0, 2⁶⁴).
+        places: `Wiring.seeds`.
+
+    Raises:
+        PlantError: the seed is no such integer.
     """
     try:
         integer = operator.index(seed)
@@ -283,26 +360,34 @@ def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
         integer = -1
     if not 0 <= integer < 1 << 64:
         raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
-    words, shift = [], 0
+    words = []
     for place in places:
-        bits = 64 if place.type in _WIDE else 32
-        words.append((place, integer >> shift & (1 << bits) - 1))
-        shift += bits
+        bits = 64 if place.type in WIDE_INTEGERS else 32
+        words.append((place, integer & (1 << bits) - 1))
+        integer >>= bits
     return words
 
 
 def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, float]]:
     """FMI type and value of each parameter that differs by scenario, the seed's words too.
 
-    `plant_seed`, 64 bits, is the first of `cosim.core.simulation.spawn_seeds`; an Integer, which
-    has 32 bits and a sign, takes its low word, the next one the high word. Raises PlantError where
-    the scenario's FMU does not fit it.
+    Args:
+        scenario: names FMU and parameters.
+        plant_seed: 64 bits, the first of `cosim.core.simulation.spawn_seeds`.
+
+    Raises:
+        PlantError: the scenario's FMU does not fit it.
     """
     fmu = unpack(scenario.plant.fmu)
     wiring = Wiring(scenario, fmu)
-    names = {(int(v.valueReference), v.type): name for name, v in fmu.variables.items()}
-    found = {names[place[:2]]: (place.type, value) for place, value in wiring.starts}
-    for place, value in seed_words(plant_seed, wiring.seeds):
-        signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
-        found[names[place[:2]]] = (place.type, signed)
-    return found
+    names = {}
+    for name, variable in fmu.variables.items():
+        names[int(variable.valueReference), variable.type] = name
+    values: dict[str, tuple[str, float]] = {}
+    for place, start in wiring.starts:
+        values[names[place.reference, place.type]] = (place.type, start)
+    for place, word in seed_words(plant_seed, wiring.seeds):
+        # FMI 2.0's Integer has a sign.
+        signed = word - (1 << 32) if place.type == "Integer" and word >= 1 << 31 else word
+        values[names[place.reference, place.type]] = (place.type, signed)
+    return values

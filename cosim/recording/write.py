@@ -24,10 +24,10 @@ from rerun import escape_entity_path_part as escaped
 
 from cosim.core.errors import RecordingError
 from cosim.core.files import check_target, publish
+from cosim.core.loop import controller_name
 from cosim.core.protocols import Array, Controller
 from cosim.core.result import markdown_table
 from cosim.core.scenario import Scenario
-from cosim.core.simulation import controller_name
 from cosim.core.trajectory import SIGNALS, RunSignals, SignalKind
 from cosim.recording.read import SAMPLE, SIGNAL, TIME
 

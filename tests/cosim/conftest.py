@@ -12,12 +12,6 @@ def plant(request, paper):
 
 
 @pytest.fixture
-def unwatched(monkeypatch):
-    """Foreign code is run in this process, where a test is not about the process of its own."""
-    monkeypatch.setattr("cosim.core.processes._watched", True)
-
-
-@pytest.fixture
 def cosim(monkeypatch, capfd, tmp_path):
     """Run the command line in this process; returns exit code, standard output and error."""
     from cosim.cli import main

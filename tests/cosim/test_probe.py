@@ -6,7 +6,7 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.errors import CapabilityError, PlantError
-from cosim.plant.probe import Kind, Restart, probe
+from cosim.plant.probe import OutputKind, Restart, probe
 from tests.helpers.kinds import build_habits, habit_scenario
 from tests.helpers.loop import Playback
 
@@ -238,13 +238,13 @@ def test_a_report_says_what_was_found(made):
 
 
 def test_an_fmu_that_bears_small_changes_only_is_tried_with_those(made):
-    assert probe(made(FRAIL)).kinds == {"cost": Kind.FOLLOWS, "d": Kind.INSTANT}
-    assert probe(made(FRAIL | LAGGED)).kinds == {"cost": Kind.SAMPLE, "d": Kind.SAMPLE}
+    assert probe(made(FRAIL)).kinds == {"cost": OutputKind.FOLLOWS, "d": OutputKind.INSTANT}
+    assert probe(made(FRAIL | LAGGED)).kinds == {"cost": OutputKind.SAMPLE, "d": OutputKind.SAMPLE}
 
 
 def test_a_plant_with_noise_of_its_own_is_read_in_the_order_that_fmi_allows(made):
     report = probe(made(RESTLESS))
-    assert set(report.kinds.values()) == {Kind.OPEN}
+    assert set(report.kinds.values()) == {OutputKind.OPEN}
     assert (report.outputs, report.restart) == ("after-step", Restart.FRESH)
 
 
@@ -254,4 +254,4 @@ def test_our_own_fmus_are_seen_as_they_are():
         assert (report.outputs, report.restart) == ("before-step", Restart.RESET), name
         assert report.snapshots, name
         assert report.serialises, name
-    assert probe(Scenario.load("paper")).kinds["economic_cost"] is Kind.FOLLOWS
+    assert probe(Scenario.load("paper")).kinds["economic_cost"] is OutputKind.FOLLOWS

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from controllers.factories import naive
-from cosim import FmuPlant, evaluate, simulate, statistics
+from cosim import FmuPlant, evaluate, simulate
+from cosim.core import statistics
 from cosim.evaluation import judge
 from cosim.studies import operation
 

@@ -1,1 +1,1 @@
-from tests.cosim.conftest import cosim, unwatched  # noqa: F401 (fixtures)
+from tests.cosim.conftest import cosim  # noqa: F401 (a fixture)

@@ -136,7 +136,7 @@ def test_a_clock_that_jumps_changes_no_result(monkeypatch, tmp_path):
 
     steady = run("steady.csv")
     jumps = lambda: float(rng.uniform(-1e9, 1e9))  # noqa: E731
-    monkeypatch.setattr("cosim.core.simulation.perf_counter", jumps)
+    monkeypatch.setattr("cosim.core.loop.perf_counter", jumps)
     monkeypatch.setattr("time.time", jumps)
     assert run("jumping.csv") == steady
 
@@ -149,12 +149,11 @@ def tank(tmp_path_factory):
     return build_tank(tmp_path_factory.mktemp("tank"), saves=True)
 
 
-@pytest.mark.parametrize(("fault", "reason"), [(1, "returned x = nan at step 0"), (5, "SIGABRT")])
-def test_a_failing_plant_ends_the_run_in_one_line(tmp_path, tank, fault, reason):
-    scenario = write_scenario(tmp_path, tank, fault=fault)
+def test_a_failing_plant_ends_the_run_in_one_line(tmp_path, tank):
+    scenario = write_scenario(tmp_path, tank, fault=1)
     words = f"simulate -s {scenario} -c tests.helpers.loop:hold -n 5 --out out"
     said = refused(command_line(tmp_path, *words.split()))
-    assert reason in said
+    assert "returned x = nan at step 0" in said
     assert not list((tmp_path / "out").glob("*"))
 
 

@@ -225,7 +225,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize("line", WRONG)
-def test_a_wrong_name_is_one_line_and_exit_code_2(cosim, unwatched, tmp_path, line):
+def test_a_wrong_name_is_one_line_and_exit_code_2(cosim, tmp_path, line):
     (tmp_path / "blocked").write_text("this is no folder, and no file of any known kind\n")
     (tmp_path / "type.toml").write_text('extends = "paper"\ndiscount = "high"\n')
     code, out, err = cosim(*line.split())

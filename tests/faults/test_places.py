@@ -78,7 +78,7 @@ def seen(folder):
 
 @pytest.mark.parametrize("kind", [*PLACES, *CONTENTS])
 @pytest.mark.parametrize("words", READING)
-def test_an_input_of_any_kind_is_refused(cosim, unwatched, limited, tmp_path, words, kind):
+def test_an_input_of_any_kind_is_refused(cosim, limited, tmp_path, words, kind):
     suffix = ".rrd" if "view" in words else ".fmu" if "fmu" in words else ".toml"
     (tmp_path / "in").mkdir()
     path = tmp_path / "in" / f"given{suffix}"

@@ -39,7 +39,8 @@ def build_elsewhere(root: Path, every_platform: bool) -> Path:
         shutil.copytree(evaporator.PACKAGE.parent / name, root / name, ignore=ignored)
     (root / "fmus" / "sources" / "variables.h").unlink()
     code = (
-        "import pathlib, sys, fmus.evaporator as e; e.build(pathlib.Path('out'), len(sys.argv) > 1)"
+        "import pathlib, sys, fmus.evaporator as e; "
+        "e.build_evaporator(pathlib.Path('out'), len(sys.argv) > 1)"
     )
     subprocess.run([sys.executable, "-c", code, *["all"] * every_platform], cwd=root, check=True)
     return root / "out"
@@ -64,7 +65,7 @@ def test_two_local_builds_are_byte_identical(tmp_path: Path) -> None:
     Another compiler, the same bits: the seeded normal law with fouling among them.
     """
     elsewhere = build_elsewhere(tmp_path / "clean checkout", every_platform=False)
-    for path in evaporator.build(tmp_path / "here"):
+    for path in evaporator.build_evaporator(tmp_path / "here"):
         assert path.read_bytes() == (elsewhere / path.name).read_bytes()
         differing = evaporator.differences(path, fmus.path(path.stem))
         assert {name for name in differing if not name.startswith("binaries/")} == {

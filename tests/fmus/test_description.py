@@ -171,7 +171,7 @@ def members(model) -> dict[str, str]:
     return {each.get("memberName"): causality[each.get("variableName")] for each in found}
 
 
-@pytest.mark.parametrize("name", ["paper", *plants.PLANTS])
+@pytest.mark.parametrize("name", ["paper", *plants.SHIPPED_PLANTS])
 def test_the_terminals_of_plant_and_controller_fit_each_other(name):
     plant = members(EVAPORATOR if name == "paper" else plants.model(name))
     scenario = Scenario.load(name).replace({"controller": {"horizon": 2}})

@@ -35,7 +35,7 @@ class Plant:
         return build_plant(plants.model(self.name), plants.equations(self.name), target, version)
 
 
-@pytest.fixture(scope="module", params=plants.PLANTS)
+@pytest.fixture(scope="module", params=plants.SHIPPED_PLANTS)
 def example(request, tmp_path_factory):
     return Plant(request.param, tmp_path_factory.mktemp(request.param))
 

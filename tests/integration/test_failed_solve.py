@@ -2,7 +2,8 @@
 
 The last action is applied once more, the guess is forgotten, and the next sample is solved from the
 reference. The loops: Python's, interpreted and compiled; the compiled one; a training's; a rollout
-on an empirical model, in Python and in C; the exported controller.
+on an empirical model, in Python and in C; the search of a back-off on the controller's own model;
+the exported controller.
 """
 
 import subprocess
@@ -14,6 +15,7 @@ from controllers import Parameters, Problem, RtiNmpc, functions
 from controllers.export import core, plain_c
 from cosim import FmuPlant, Scenario, simulate, train
 from cosim.core.simulation import spawn_seeds
+from learning import backed_off
 from learning.empirical_model import EmpiricalModel, Features
 from learning.rollout import Rollout
 from tests.helpers.compiler import needs_compiler
@@ -166,6 +168,35 @@ def test_a_rollout_on_an_empirical_model(problem, fitted, request, language):
         predicted, h, _ = fitted.predict(inputs[k : k + 1])
         s = (predicted[0] + h[0] * fitted.residuals[picks[k]])[:-1]
     assert 3 < sum(rule.failures) < SAMPLES - 3
+
+
+def test_the_search_of_a_back_off(scenario, problem, monkeypatch):
+    transitions = []
+
+    class FirstSegment(backed_off.BackOffSearch):
+        """Keeps its samples, and ends."""
+
+        def observe(self, transition):
+            transitions.append(transition)
+            self.has_ended = len(transitions) == SAMPLES
+            return self.has_ended
+
+    # The plant knows no limit.
+    plant = backed_off.GuessedPlant(Scenario.load("paper"), 0.1)
+    monkeypatch.setattr(backed_off, "BackOffSearch", FirstSegment)
+    monkeypatch.setattr(backed_off, "GuessedPlant", lambda scenario, deviation: plant)
+    parameters = Parameters.naive(problem)
+    backed_off.back_off(parameters, scenario)
+    seed = int(np.random.default_rng(0).integers(2**63, size=12)[0])
+    rule, s = Rule(problem, parameters), plant.reset(seed)
+    for transition in transitions:
+        a = rule(s)
+        if transition is not None:
+            np.testing.assert_array_equal(transition.s, s)
+            np.testing.assert_array_equal(transition.a, a)
+        s = plant.step(a).s
+    assert [transition is None for transition in transitions] == rule.failures
+    assert 5 < sum(rule.failures) < SAMPLES - 5
 
 
 @pytest.mark.slow

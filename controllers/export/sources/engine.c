@@ -1,9 +1,7 @@
-/* The library that runs `controllers.RtiNmpc`: the phases of a sample, and whole closed loops. */
+/* The library that runs `controllers.RtiNmpc`: the phases of a sample, and whole closed loops with an
+ * FMU. */
 #define _POSIX_C_SOURCE 199309L
-#include <stddef.h>
-#include <time.h>
-
-#include "core.h"
+#include "loop.h"
 #include "sensitivities.h"
 
 size_t engine_sizes(int what) {
@@ -11,8 +9,7 @@ size_t engine_sizes(int what) {
 }
 
 int engine_prepare(RtiPrepared *prepared, RtiWork *work) {
-    const int status = rti_prepare(prepared);
-    return status == RTI_SOLVED ? rti_load(prepared, work) : status;
+    return loop_prepare(prepared, work);
 }
 
 int engine_feedback(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solved, const double a[]) {
@@ -38,7 +35,7 @@ void engine_batch(RtiPrepared *prepared, RtiSolved *solved, RtiWork *work, long 
             memcpy(prepared->theta, theta[k], sizeof theta[k]);
             memcpy(prepared->x, x[k], sizeof x[k]);
             memcpy(prepared->u, u[k], sizeof u[k]);
-            ready = well_posed(prepared->theta) ? engine_prepare(prepared, work) : RTI_ILL_POSED;
+            ready = loop_prepare(prepared, work);
         }
         const double *const a = enforced ? enforced[k] : 0;
         double *const slope = slopes ? slopes + k * (VALUE + POLICY) : 0;
@@ -78,8 +75,6 @@ typedef struct {
 /* `cosim.plant.fmi.Order` says which FMU takes which. */
 enum { SET_GET_STEP, GET_SET_STEP, SET_STEP_GET };
 
-enum { OK, FAILED_SET, FAILED_GET, FAILED_STEP, ENDED, NOT_FINITE };
-
 static int refused(int status) { return status != 0 && status != 1; }
 
 static int plant_get(const Plant *plant, const unsigned references[], size_t count, double values[]) {
@@ -92,11 +87,13 @@ static int plant_get(const Plant *plant, const unsigned references[], size_t cou
 
 /* Write the inputs, step, read the states, and the outputs before or after the step as `order` says;
  * `status` gets FMI's own. */
-static int plant_step(const Plant *plant, double time, int *status) {
+static int plant_step(void *instance, long long sample, int *status) {
     typedef int (*Set2)(void *, const unsigned *, size_t, const double *);
     typedef int (*Set3)(void *, const unsigned *, size_t, const double *, size_t);
     typedef int (*Step2)(void *, double, double, int);
     typedef int (*Step3)(void *, double, double, _Bool, _Bool *, _Bool *, _Bool *, double *);
+    const Plant *const plant = instance;
+    const double time = plant->start_time + (double)sample * plant->step_size;
     _Bool event = 0, terminate = 0, early = 0;
     double last = INFINITY; /* where the FMU does not say how far it came */
     if (plant->order == GET_SET_STEP) {
@@ -128,78 +125,15 @@ static int plant_step(const Plant *plant, double time, int *status) {
                                                                                        : NOT_FINITE;
 }
 
-static double seconds(void) {
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
-}
-
-/* A closed loop between two calls. A row of `table` is a sample: state, action, the plant's outputs
- * (stage cost and disturbance), value, residual, whether the controller failed, and the seconds of
- * preparation, feedback and plant. `pending` says whether there is a solution to shift. */
-typedef struct {
-    RtiPrepared *prepared;
-    RtiSolved *solved;
-    RtiWork *work;
-    double applied[N_U];
-    long long pending;
-} Loop;
-
-static void rti_start(RtiPrepared *prepared) {
-    for (int k = 0; k < HORIZON; k++) {
-        memcpy(prepared->x[k], REFERENCE_STATE, sizeof prepared->x[k]);
-        memcpy(prepared->u[k], REFERENCE_ACTION, sizeof prepared->u[k]);
-    }
-    memset(prepared->costates, 0, sizeof prepared->costates);
-}
-
 size_t engine_loop_size(void) { return sizeof(Loop); }
 
 void engine_begin(Loop *loop, RtiPrepared *prepared, RtiSolved *solved, RtiWork *work) {
-    loop->prepared = prepared;
-    loop->solved = solved;
-    loop->work = work;
-    loop->pending = 0;
-    rti_start(prepared);
-    memcpy(loop->applied, REFERENCE_ACTION, sizeof loop->applied);
+    loop_begin(loop, prepared, solved, work);
 }
 
-/* Samples `first` to `end` of a loop; returns the sample at which the plant failed, or `end`.
- * `fault` gets what failed there and FMI's status. */
-long long engine_run(Loop *loop, const Plant *plant, long long first, long long end, double *table,
+/* `loop_run` with an FMU, whose outputs are the stage cost and the disturbance. */
+long long engine_run(Loop *loop, Plant *fmu, long long first, long long end, double *table,
                      int fault[2]) {
-    for (long long sample = first; sample < end; sample++) {
-        const double begin = seconds();
-        if (loop->pending) rti_shift(loop->prepared, loop->solved);
-        int status = engine_prepare(loop->prepared, loop->work);
-        const double middle = seconds();
-        memcpy(loop->solved->s, plant->state, sizeof loop->solved->s);
-        if (status == RTI_SOLVED)
-            status = rti_feedback(loop->prepared, loop->work, loop->solved, 0);
-        const double solved = seconds();
-        const int failed = status != RTI_SOLVED;
-        loop->pending = !failed;
-        if (failed) rti_start(loop->prepared);
-        for (int i = 0; !failed && i < N_U; i++)
-            loop->applied[i] =
-                qp_clip(rti_action(loop->solved, 0, i), ACTION_LOWER[i], ACTION_UPPER[i]);
-        memcpy(table, plant->state, N_X * sizeof(double));
-        memcpy(table + N_X, loop->applied, N_U * sizeof(double));
-        table += N_W;
-        memcpy(plant->input, loop->applied, N_U * sizeof(double));
-        const double before = seconds();
-        const double time = plant->start_time + (double)sample * plant->step_size;
-        fault[0] = plant_step(plant, time, &fault[1]);
-        const double after = seconds();
-        if (fault[0] != OK) return sample;
-        memcpy(table, plant->output, plant->n_outputs * sizeof(double));
-        table += plant->n_outputs;
-        *table++ = failed ? NAN : loop->solved->read[READ_value];
-        *table++ = failed ? NAN : loop->solved->read[READ_residual];
-        *table++ = failed;
-        *table++ = middle - begin;
-        *table++ = solved - middle;
-        *table++ = after - before;
-    }
-    return end;
+    const LoopPlant plant = {plant_step, fmu, fmu->input, fmu->state, fmu->output, fmu->n_outputs};
+    return loop_run(loop, &plant, first, end, table, fault);
 }

@@ -9,8 +9,6 @@ from cosim import FmuPlant, Scenario
 from tests.helpers.kinds import REALS, build_kind
 from tests.helpers.tank import build_tank, edited
 
-pytestmark = pytest.mark.usefixtures("unwatched")
-
 
 def drift(scenario):
     """How far a sample moves the undisturbed plant from its reference, as a share of it."""

@@ -82,7 +82,7 @@ class Mine(QLearning):
 """
 
 
-def test_a_run_of_an_edited_rule_is_not_resumed(cosim, unwatched, undrawn, tmp_path):
+def test_a_run_of_an_edited_rule_is_not_resumed(cosim, undrawn, tmp_path):
     (tmp_path / "mine.py").write_text(OWN)
     (tmp_path / "helper_of_mine.py").write_text("X = 1\n")
     own = ("train", "-a", "mine:Mine", *SHORT[3:], "--out", "run")

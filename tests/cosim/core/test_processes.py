@@ -1,20 +1,17 @@
-"""Whatever ends a command ends what it started; one writer per folder; foreign code is watched."""
+"""Whatever ends a command ends what it started; one writer per folder."""
 
 import os
 import re
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
 
 from cosim.core import processes
 from cosim.core.errors import CosimError
 from cosim.core.processes import child_process
-from tests.helpers.command import alive, eventually, run_cosim, start_cosim
-from tests.helpers.kinds import build_kind, scenario_for
+from tests.helpers.command import alive, eventually, run_cosim
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 SLOW = pytest.mark.slow
@@ -138,47 +135,6 @@ def test_the_lock_of_a_killed_process_is_given_back(holder, tmp_path):
     assert run_cosim("simulate", "-n", "10", "--out", tmp_path / "out").returncode == 0
     left = {path.name for path in (tmp_path / "out").iterdir()}
     assert not left & {processes.LOCK, processes.HOLDER}
-
-
-def run_foreign(folder, fmu, fault, *more):
-    """A short run of an FMU with a fault of its kind."""
-    scenario = scenario_for(folder, fmu, fault=fault)
-    words = ["simulate", "-s", scenario, "-c", "tests.helpers.loop:hold", "-n", 3, "--out", "out"]
-    environment = {"PYTHONPATH": str(Path(__file__).parents[3])}
-    return run_cosim(*words, *more, folder=folder, env=environment)
-
-
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        (3, "with exit code 0 before the command finished"),
-        pytest.param(4, "with exit code 0 before the command finished", marks=SLOW),
-        pytest.param(8, "by SIGKILL before the command finished", marks=SLOW),
-        pytest.param(9, "by SIGSEGV before the command finished", marks=SLOW),
-    ],
-    ids=["exit", "_exit", "kill", "crash"],
-)
-def test_an_fmu_that_ends_the_process_is_one_line_and_exit_code_2(tmp_path, fault, words):
-    result = run_foreign(tmp_path, build_kind(tmp_path, 2), fault)
-    assert result.returncode == 2
-    (line,) = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
-    assert words in line
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-@SLOW
-def test_the_watched_process_ends_with_the_watching_one(tmp_path):
-    scenario = scenario_for(tmp_path, build_kind(tmp_path, 2), fault=12)
-    words = ["simulate", "-s", scenario, "-c", "tests.helpers.loop:hold", "-n", 3, "--out", "out"]
-    environment = {"PYTHONPATH": str(Path(__file__).parents[3])}
-    with start_cosim(*words, folder=tmp_path, env=environment) as process:
-        assert "native code of" in process.stderr.readline()
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        # The watched process holds the other end of the pipe until it ends, too.
-        begin = time.monotonic()
-        process.stderr.read()
-        assert time.monotonic() - begin < 30.0
 
 
 @SLOW

@@ -65,7 +65,7 @@ TOY = SignalKind("distance", distance, "%", "costs")
 @pytest.fixture
 def toy(monkeypatch):
     """A signal more, declared in the one place there is."""
-    for module in ("trajectory", "simulation", "recording.write"):
+    for module in ("core.trajectory", "core.simulation", "recording.write"):
         monkeypatch.setattr(f"cosim.{module}.SIGNALS", (*SIGNALS, TOY))
 
 

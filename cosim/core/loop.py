@@ -1,0 +1,216 @@
+"""The closed loop of a plant and a controller, sample by sample, and its rule of a failed solve.
+
+Every closed loop in Python is this one: a simulation, a training, a rollout on an empirical model,
+the search of a back-off on the controller's own model. Its counterpart in C is
+`controllers/export/sources/loop.h`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosim.core.errors import CosimError
+from cosim.core.protocols import ActionLimits, Array, Controller, Solution, Step
+
+
+class Sample(NamedTuple):
+    """One sample of a closed loop.
+
+    Attributes:
+        s: state x_k, (n,).
+        solution: the controller's; None after a failed solve.
+        a: applied action u_k, (m,).
+        step: what the plant gave, x_{k+1} included.
+        prepare_time, feedback_time, plant_time: seconds of the three phases.
+    """
+
+    s: Array
+    solution: Solution | None
+    a: Array
+    step: Step
+    prepare_time: float
+    feedback_time: float
+    plant_time: float
+
+
+class ClosedLoop:
+    """A plant and a controller in closed loop.
+
+    A sample is `prepare`, then `feedback(s)`, then the plant steps under the action, saturated to
+    the actuators' bounds. A failed solve is an exception whose class has `is_solver_failure`: the
+    last applied action (first the reference action) is then applied once more, and the controller
+    is reset. Every other error is raised.
+
+    Args:
+        step: the plant, from an action (m,) to what its next sample gave.
+        controller: the feedback law.
+        limits: bounds of the actuators, and the action of the first fallback.
+        keeps_points: whether `point` is read from the controller.
+
+    Attributes:
+        lower, upper: bounds of the actuators, (m,).
+        s: present state, (n,).
+        number: of samples since the start.
+        applied: action of the last sample, (m,); before the first, the reference action.
+        solution: for the present state, once it is solved for; None after a failed solve.
+        point: where the controller's QP was linearised for `solution`; None after a failed solve.
+    """
+
+    def __init__(
+        self,
+        step: Callable[[Array], Step],
+        controller: Controller,
+        limits: ActionLimits,
+        *,
+        keeps_points: bool = False,
+    ) -> None:
+        self._step = step
+        self._controller = controller
+        self._limits = limits
+        self.lower = limits.action_lower
+        self.upper = limits.action_upper
+        self._keeps_points = keeps_points
+        self.s: Array = np.empty(0)
+        self.number = 0
+        self.applied = limits.reference_action
+        self.solution: Any = None
+        self.point: Any = None
+        self._prepare_time = 0.0
+        self._feedback_time = 0.0
+
+    def start(self, s: Array) -> None:
+        """Begin an episode at the state s (n,), to which the plant has been reset."""
+        s.flags.writeable = False
+        self.s = s
+        self.number = 0
+        self.applied = self._limits.reference_action
+        self._controller.reset()
+
+    def advance(self) -> Sample:
+        """Solve for the present state, and let the plant take a sample under the action."""
+        self.solve()
+        return self.step(self.action())
+
+    def solve(self, *, prepare: bool = True) -> bool:
+        """Prepare, and feed the present state back, into `solution`.
+
+        Args:
+            prepare: whether to prepare; else the controller's own preparation is used.
+
+        Returns:
+            Whether there is a solution.
+
+        Raises:
+            CosimError: the controller gave what is no solution.
+        """
+        begin = middle = perf_counter()
+        # The two phases are timed apart: only feedback delays the action.
+        try:
+            if prepare:
+                self._controller.prepare()
+                # Now: a feedback of several QPs linearises elsewhere.
+                if self._keeps_points:
+                    self.point = self._controller.linearisation_point  # type: ignore[attr-defined]
+                middle = perf_counter()
+            self.solution = self._controller.feedback(self.s)
+            end = perf_counter()
+            self._check_solution()
+        except Exception as error:
+            end = perf_counter()
+            self._recover(error)
+        self._prepare_time = middle - begin
+        self._feedback_time = end - middle
+        return self.solution is not None
+
+    def solve_for(self, a: Array) -> Any:
+        """Solution for Q(s, a) with the preparation of `solve`; None after a failed solve.
+
+        Args:
+            a: action that is enforced, (m,).
+        """
+        try:
+            return self._controller.feedback(self.s, a)
+        except Exception as error:
+            self._recover(error)
+            return None
+
+    def action(self) -> Array:
+        """The action of the present sample, (m,): the solution's, or the last one once more."""
+        if self.solution is None:
+            return self.applied
+        action = self.solution.action
+        # NumPy would spread a number over all inputs, and take truth for one.
+        if not isinstance(action, np.ndarray) or action.dtype.kind not in "fiu":
+            given = f"{type(action).__name__} {action}"
+        elif action.shape != self.lower.shape:
+            given = f"shape {action.shape}"
+        else:
+            return self.saturate(action)
+        raise self.wrong(f"an action of {given}, not {self.lower.shape}", number=self.number)
+
+    def saturate(self, action: Array) -> Array:
+        """An action (m,) within the actuators' bounds: the QP keeps them to its tolerance only."""
+        return np.minimum(np.maximum(action, self.lower), self.upper)
+
+    def step(self, a: Array) -> Sample:
+        """Let the plant take a sample.
+
+        Args:
+            a: action within the actuators' bounds, (m,).
+
+        Returns:
+            The sample; a later change of its states or action is an error.
+
+        Raises:
+            PlantError: by the plant; the loop is still before the sample.
+        """
+        begin = perf_counter()
+        step = self._step(a)
+        plant_time = perf_counter() - begin
+        sample = Sample(
+            self.s, self.solution, a, step, self._prepare_time, self._feedback_time, plant_time
+        )
+        # Controllers and rules read these arrays, and may keep them.
+        a.flags.writeable = False
+        step.s.flags.writeable = False
+        self.s = step.s
+        self.applied = a
+        self.number += 1
+        return sample
+
+    def wrong(self, given: str, number: int | None = None) -> CosimError:
+        """An error that names the controller.
+
+        Args:
+            given: what the controller gave, in words.
+            number: of the sample; None where it does not matter.
+        """
+        where = "" if number is None else f", at step {number}"
+        return CosimError(f"{controller_name(self._controller)} gave {given}{where}")
+
+    def _check_solution(self) -> None:
+        """Raise CosimError where a foreign controller's solution lacks an action or a status."""
+        solution = self.solution
+        if not hasattr(solution, "action"):
+            raise self.wrong(f"a {type(solution).__name__}, which is no solution")
+        status = getattr(solution, "status", None)
+        if not isinstance(status, str):
+            raise self.wrong(f"a status that is no text but {status!r:.60}")
+
+    def _recover(self, error: Exception) -> None:
+        """The rule of a failed solve; raises every other error."""
+        if not getattr(type(error), "is_solver_failure", False):
+            raise error
+        # What led to the failure is forgotten: the next sample is solved from the reference.
+        self._controller.reset()
+        self.solution = None
+        self.point = None
+
+
+def controller_name(controller: Any) -> str:
+    """Name of a controller for tables: its `name`, else its class's."""
+    return str(getattr(controller, "name", type(controller).__name__))

@@ -107,7 +107,7 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
                 _forget_edited_modules()
             found: Any = importlib.import_module(module)
             if foreign and (place := _place(module)) is not None:
-                _loaded.setdefault(place, _sources_hash(place))
+                _hash_when_loaded(place)
         for part in attribute.split("."):
             found = getattr(found, part)
     # A module may raise anything while it is imported, and one that is a script may even exit.
@@ -155,7 +155,7 @@ def code_of(module: str) -> str | None:
     installed = bool(INSTALLED & set(place.parts))
     if not installed and any(place.is_relative_to(folder) for folder in PYTHON):
         return None
-    code = _loaded.setdefault(place, _sources_hash(place))
+    code = _hash_when_loaded(place)
     names = _distributions().get(top, []) if installed else []
     return " ".join([*(f"{name} {version(name)}" for name in names), code])
 
@@ -180,6 +180,14 @@ def _place(module: str) -> Path | None:
     if folder.name not in INSTALLED:
         return folder
     return path if not inner else path.parents[inner - 1]
+
+
+def _hash_when_loaded(place: Path) -> str:
+    """Hash of the sources at a place, as of the time when its modules were first loaded."""
+    # Reading them takes some 50 ms of a folder with 500 modules: not again for each question.
+    if place not in _loaded:
+        _loaded[place] = _sources_hash(place)
+    return _loaded[place]
 
 
 def _forget_edited_modules() -> None:

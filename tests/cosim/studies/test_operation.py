@@ -3,6 +3,7 @@ import pandas as pd
 
 from cosim import study
 from cosim.studies.operation import LIFE, SHIFT, dearer_than, judged, tables
+from tests.helpers.toy_study import SCENARIO
 
 
 def test_noise_alone_makes_no_shift_dearer_and_a_dearer_one_is_found(rng):
@@ -24,12 +25,14 @@ def test_a_run_that_diverged_is_dearer_in_each_shift_since():
 
 def test_a_study_in_operation_without_a_training_has_a_report(tmp_path):
     document = {"schema": 1, "name": "fixed", "scenarios": ["paper"], "operation": {"hours": [1]}}
+    document["scenario"] = [SCENARIO]
     document |= {"case": [{"controller": "naive"}], "evaluation": {"seeds": 2, "steps": 10}}
     assert study(document | {"curves": {"seeds": 2, "steps": 10}}, tmp_path).report().is_file()
 
 
 def test_a_study_in_operation_keeps_a_log_without_a_picture_of_it(tmp_path):
     document = {"schema": 1, "name": "fixed", "scenarios": ["paper"], "operation": {"hours": [1]}}
+    document["scenario"] = [SCENARIO]
     document |= {"case": [{"name": "h", "algorithm": "fixed"}], "training_seeds": {"count": 1}}
     document |= {"evaluation": {"seeds": 1, "steps": 20}, "curves": {"seeds": 2, "steps": 10}}
     study(document | {"logs": ["h"]}, tmp_path)

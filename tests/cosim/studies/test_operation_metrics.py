@@ -6,11 +6,11 @@ import pytest
 from scipy import stats
 
 from controllers.factories import nmpc
-from cosim import FmuPlant, Scenario, study
+from cosim import FmuPlant, study
 from cosim.core.simulation import spawn_seeds
 from cosim.studies.operation import LIFE, SHIFT, dearer_than, judged, metrics, tables
 from learning.training_run import make_run
-from tests.helpers.toy_study import case, document
+from tests.helpers.toy_study import case, document, toy_scenario
 
 NOBODY = np.zeros(1000, dtype=bool)
 
@@ -205,7 +205,7 @@ def test_the_first_change_counts_the_samples_before_it_and_their_cost_is_the_sta
 
 def start_in_closed_loop(samples, seed):
     """Costs of θ as it starts, and whether a bound is violated, in a loop of this test's own."""
-    scenario = Scenario.load("paper")
+    scenario = toy_scenario()
     run = make_run("fixed", scenario, samples, seed=seed)
     controller = nmpc(scenario, run.starting_parameters(), "rti")
     costs, violating = [], []

@@ -245,12 +245,16 @@ def _read(path: Path, keys: list[str]) -> pd.DataFrame:
         name, _, unit = title.partition(" [")
         names[title] = name
         units[name] = unit.removesuffix("]")
-    frame = frame.rename(columns=names)
+    columns: dict[str, list[str] | list[float]] = {}
     try:
-        frame = frame.map(_rounded).set_index(keys)
-        numbers = [column for column in frame if column not in WORDS]
-        frame = frame.replace(dict.fromkeys(numbers, ""), "nan")
-        frame = frame.astype(dict.fromkeys(numbers, float))
+        for title in frame:
+            name = names[title]
+            cells = [_rounded(cell) for cell in frame[title]]
+            if name in keys or name in WORDS:
+                columns[name] = cells
+            else:
+                columns[name] = [float(cell or "nan") for cell in cells]
+        frame = pd.DataFrame(columns).set_index(keys)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the stored table '{path}' is damaged: {error}") from None
     if not frame.index.is_unique:
@@ -290,11 +294,13 @@ def _table_differences(
             lost.append(f"{name}: signal {', '.join(lone)} is {columns}")
     common = stored.index.intersection(now.index, sort=False)
     units = now.attrs | stored.attrs
+    # Taken once: to take them for each signal is most of the time that a check needs.
+    stored_rows, rows_now = stored.loc[common], now.loc[common]
     first: list[tuple[int, str]] = []
     for signal in stored.columns.intersection(now.columns, sort=False):
-        before, after = stored.loc[common, signal], now.loc[common, signal]
+        before, after = stored_rows[signal].to_numpy(), rows_now[signal].to_numpy()
         if signal in WORDS:
-            differs = (before != after).to_numpy()
+            differs = before != after
             bound = ""
         else:
             tolerance = _tolerance(signal, units[signal], tolerances)

@@ -314,7 +314,7 @@ class Study:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StudyPlan:
     """The runs of a study: controllers first, then seed by seed."""
 
     definition: Study
@@ -327,7 +327,7 @@ class Plan:
         return sum(run.samples for run in self.runs)
 
 
-def plan(study: Study) -> Plan:
+def plan(study: Study) -> StudyPlan:
     """The runs of a study; every mistake in it is raised here, before the work."""
     plants = {}
     for name, described in study.scenarios.items():
@@ -345,7 +345,7 @@ def plan(study: Study) -> Plan:
         runs.append(_run(study, case, name, seed, content[case.name, name]))
     _check_names(study)
     about = {"versions": versions(), "code_hash": code_hash()}
-    return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
+    return StudyPlan(study, runs, about | {"scenarios": plants, "study": study.name})
 
 
 @dataclass(frozen=True)

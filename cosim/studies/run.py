@@ -238,9 +238,10 @@ def _in_operation(
     from cosim.studies import operation  # noqa: PLC0415
     from learning.log import to_csv  # noqa: PLC0415
 
-    rows, status, clock, taken = operation.live(run, marks)
-    about = {"status": status, "samples": marks[-1], "plant_samples": taken}
-    return to_csv(rows), rows[-1].parameters.to_toml(), about | {"processor_seconds": clock}
+    done = operation.run_in_operation(run, marks)
+    about = {"status": done.status, "samples": marks[-1], "plant_samples": done.plant_samples}
+    about["processor_seconds"] = done.processor_seconds
+    return to_csv(done.rows), done.rows[-1].parameters.to_toml(), about
 
 
 def _in_episodes(

@@ -26,13 +26,13 @@ from cosim.studies.results import (
     ABOUT,
     AGGREGATE,
     CURVES,
-    KEYS,
     OPERATION,
+    RUN_KEYS,
+    RUNS_TABLE,
     SUMMARY,
     WHERE,
     StudyResults,
 )
-from cosim.studies.results import RUNS as RUNS_TABLE
 from cosim.studies.run import GREEDY, RUNS, to_csv
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
@@ -41,13 +41,13 @@ WORK = ".work"
 WORDS = ("status", "against", "hash")
 """Columns that hold words, which must be the same; every other one holds numbers."""
 KEY_COLUMNS = {
-    EVALUATION: [*KEYS, "seed"],
-    CURVES: [*KEYS, "samples"],
-    RUNS_TABLE: KEYS,
+    EVALUATION: [*RUN_KEYS, "seed"],
+    CURVES: [*RUN_KEYS, "samples"],
+    RUNS_TABLE: RUN_KEYS,
     SUMMARY: WHERE,
     AGGREGATE: ["case"],
-    OPERATION: [*KEYS, "samples"],
-    GREEDY: [*KEYS, "samples", "seed"],
+    OPERATION: [*RUN_KEYS, "samples"],
+    GREEDY: [*RUN_KEYS, "samples", "seed"],
     LOGS: ["samples"],
     TRAJECTORIES: ["time"],
     THETA: ["schema"],
@@ -129,7 +129,7 @@ def draw(folder: Path, name: str) -> list[str]:
     for of_scenario in results.draw(stored / FOLDER, ("svg",)).values():
         names += of_scenario
     if results.about["pictures"]:  # of the trajectories and logs that the study keeps
-        names += figures.draw(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
+        names += figures.draw_kept(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
     return names
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import StudyError
-from cosim.studies.results import KEYS, StudyResults
+from cosim.studies.results import RUN_KEYS, StudyResults
 from cosim.studies.run import to_csv
 from tests.helpers.toy_study import GROW, run_toy
 
@@ -80,7 +80,7 @@ def test_tables_are_read_and_written_to_the_same_bytes(results):
 def test_an_own_reader_finds_the_stored_summary():
     """Medians and worst runs of a stored study from its evaluation alone."""
     results = StudyResults.load(ROOT / "results" / "quick")
-    cost = results.evaluation.groupby(KEYS, dropna=False).J.mean().reset_index()
+    cost = results.evaluation.groupby(RUN_KEYS, dropna=False).J.mean().reset_index()
     for row in results.summary.itertuples():
         own = cost[(cost.scenario == row.scenario) & (cost.case == row.case)].J
         best = cost[(cost.scenario == row.scenario) & (cost.case == "optimal")].J.item()

@@ -29,7 +29,7 @@ from cosim.measurement import built
 from cosim.studies.operation import OperationLayout, OperationResult
 from cosim.studies.plan import StudyPlan
 from cosim.studies.report import FOLDER
-from cosim.studies.run import LOG, PARAMETERS, Run, read_table, safe
+from cosim.studies.run import LOG, PARAMETERS, Run, folder_name, read_table
 
 BANDED = 6
 """Largest number of curves with bands in a panel: more cannot be told apart."""
@@ -334,12 +334,12 @@ def _trajectory_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figur
             if not trajectories:
                 continue
             for kind in table.figures:
-                stem = f"{kind}-{safe(name)}-{table.name}"
+                stem = f"{kind}-{folder_name(name)}-{table.name}"
                 if kind == "trajectory":
                     beside = list(trajectories.values())
                     for case, trajectory in trajectories.items():
                         drawn = trajectory_figure(trajectory, scenario, beside=beside)
-                        yield f"{stem}-{safe(case)}", drawn
+                        yield f"{stem}-{folder_name(case)}", drawn
                 elif kind == "overlay":
                     yield stem, overlay_figure(trajectories)
                 elif kind == "density":

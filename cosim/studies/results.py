@@ -35,8 +35,8 @@ from cosim.studies.run import (
     LOG,
     Runner,
     RunStore,
+    folder_name,
     read_table,
-    safe,
     to_csv,
     typed,
 )
@@ -501,7 +501,7 @@ class StudyResults(Shown):
             drawn = []
             for kind, maker in self._makers.items():
                 if (made := maker(scenario)) is not None:
-                    drawn.append((f"{kind}-{safe(scenario)}", made))
+                    drawn.append((f"{kind}-{folder_name(scenario)}", made))
             names[scenario] = save_set(drawn, folder, formats)
         return names
 
@@ -711,7 +711,7 @@ def _in_the_studys_order(plan: StudyPlan, stores: Iterable[RunStore]) -> list[Ru
     """The finished runs by scenario, case and training seed."""
     cases = [case.name for case in plan.definition.all_cases]
     places = {where: i for i, where in enumerate(product(plan.definition.scenarios, cases))}
-    finished = [store for store in stores if store.sealed]  # by training seed
+    finished = [store for store in stores if store.complete]  # by training seed
     return sorted(finished, key=lambda store: places[store.run.scenario.name, store.run.case])
 
 

@@ -33,7 +33,7 @@ from cosim.studies.results import (
     WHERE,
     StudyResults,
 )
-from cosim.studies.run import GREEDY, RUNS, to_csv
+from cosim.studies.run import GREEDY, RUNS_FOLDER, to_csv
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"
@@ -95,7 +95,12 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     for path in sorted(out.rglob("*")):
         relative = path.relative_to(out)
         kept = path.suffix in SUFFIXES or path.name == ABOUT
-        if not path.is_file() or relative.parts[0] == RUNS or path.name == TIMING or not kept:
+        if (
+            not path.is_file()
+            or relative.parts[0] == RUNS_FOLDER
+            or path.name == TIMING
+            or not kept
+        ):
             continue
         content = path.read_bytes()
         if path.suffix == ".csv":  # a last bit is no change
@@ -177,7 +182,7 @@ def compared_tables(folder: Path) -> dict[str, list[str]]:
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
         top = relative.parts[0]
-        if path.suffix not in (".csv", ".toml") or relative.name == TIMING or top == RUNS:
+        if path.suffix not in (".csv", ".toml") or relative.name == TIMING or top == RUNS_FOLDER:
             continue
         keys = KEY_COLUMNS.get(top)
         if keys is None:

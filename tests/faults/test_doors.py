@@ -69,9 +69,7 @@ def test_a_study_with_any_value_anywhere(path, value):
             study.noise(scenario)
             for one in study.cases:
                 if one.algorithm is not None:
-                    arguments = study.training(one, scenario, 0)
-                    options = arguments.pop("options")
-                    make_run(scenario=study.scenarios[scenario], **arguments, **options)
+                    study.training(one, scenario, 0, None).make_run(study.scenarios[scenario])
 
     accepted(attempt)
 

@@ -35,7 +35,9 @@ from cosim.studies.results import (
 )
 from cosim.studies.run import GREEDY, RUNS_FOLDER, to_csv
 
-TOLERANCES, DIGITS = "tolerances.toml", 8
+TOLERANCES = "tolerances.toml"
+DIGITS = 8
+"""Significant digits of stored numbers."""
 WORK = ".work"
 """Folder within the folder, of the runs of studies."""
 WORDS = ("status", "against", "hash")
@@ -115,7 +117,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     return left_out
 
 
-def draw(folder: Path, name: str) -> list[str]:
+def draw_stored(folder: Path, name: str) -> list[str]:
     """Draw the figures of a stored study, from its tables alone, as NAME/figures/*.svg.
 
     Args:
@@ -308,7 +310,7 @@ def _table_differences(
             differs = before != after
             bound = ""
         else:
-            tolerance = _tolerance(signal, units[signal], tolerances)
+            tolerance = _tolerance_of(signal, units[signal], tolerances)
             differs = ~np.isclose(after, before, 0.0, tolerance.absolute, equal_nan=True)
             bound = f", tolerance {tolerance.absolute:g} {tolerance.unit.removeprefix('1')}"
         if not differs.any():
@@ -321,18 +323,18 @@ def _table_differences(
     return lines + in_order_of_rows + lost
 
 
-def _tolerance(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
+def _tolerance_of(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
     """The signal's own tolerance, else the first matching pattern's (`theta *`)."""
-    fitting = (name for name in tolerances if fnmatchcase(signal, name))
-    name = signal if signal in tolerances else next(fitting, None)
-    if name is None:
+    names = [signal, *(name for name in tolerances if fnmatchcase(signal, name))]
+    known = [name for name in names if name in tolerances]
+    if not known:
         raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
-    if unit and unit != tolerances[name].unit:
+    tolerance = tolerances[known[0]]
+    if unit and unit != tolerance.unit:
         raise ResultsError(
-            f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in "
-            f"'{tolerances[name].unit}'"
+            f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in '{tolerance.unit}'"
         )
-    return tolerances[name]
+    return tolerance
 
 
 def _row(table: pd.DataFrame, row: object) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
-from controllers import compile_functions
+from controllers import ConvergedNmpc, RtiNmpc, compile_functions
 from cosim.core.plugins import ControllerSource
-from cosim.core.protocols import Controller
+from cosim.core.protocols import Controller, Vector
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import measure, simulate
 from cosim.plant import FmuPlant
@@ -105,28 +105,30 @@ class MeasureItem(Item[Measured]):
             yield replace(self, noise=noise)
 
     def _built(self) -> Controller:
-        if isinstance(self.controller, ControllerSource) and self.controller.theta is not None:
-            return self._with_theta(self.controller)
+        """The controller, compiled where its runs are long."""
+        if not isinstance(self.controller, ControllerSource):
+            return self._new()
+        key = repr((self.controller, sorted(self.conditions.facts.items()), self.length))
+        if key not in _kept_nmpc:
+            controller = self._new()
+            # Of these nothing but θ outlives a run; of a user's controller that is not known.
+            if type(controller) not in (RtiNmpc, ConvergedNmpc):
+                return controller
+            _kept_nmpc.clear()
+            _kept_nmpc[key] = cast(RtiNmpc, controller), cast(RtiNmpc, controller).theta
+        nmpc, theta = _kept_nmpc[key]
+        nmpc.theta = np.array(self.theta) if self.theta else theta
+        return nmpc
+
+    def _new(self) -> Controller:
         controller = built(self.controller, self.conditions.scenario)
         compile_functions(controller, self.length)
         return controller
 
-    def _with_theta(self, source: ControllerSource) -> Controller:
-        """The NMPC of a θ; to build one takes as long as 8000 of its samples."""
-        # By its content, so that no other θ or code has the same key.
-        key = repr((source, sorted(self.conditions.facts.items()), self.length))
-        if key not in _kept:
-            _kept.clear()
-            controller: Any = source.build(self.conditions.scenario)
-            compile_functions(controller, self.length)
-            _kept[key] = controller, controller.theta
-        controller, theta = _kept[key]
-        controller.theta = np.array(self.theta) if self.theta else theta
-        return controller  # type: ignore[no-any-return]
 
-
-_kept: dict[str, tuple[Any, Any]] = {}
-"""The NMPC that was built last from a θ in this process, and that θ."""
+_kept_nmpc: dict[str, tuple[RtiNmpc, Vector]] = {}
+"""The NMPC that was built last in this process, and its θ: to build one takes as long as some
+thousand of its samples, and the files of a run are several items."""
 
 
 def built(controller: ControllerSource | Factory, scenario: Scenario) -> Controller:

@@ -37,15 +37,15 @@ def compare(
         runs = comparison.load_run(a), comparison.load_run(b)
         protect(run.name for run in runs)  # of a folder, the file in it
         result = comparison.compare(
-            *runs, dict(map(_tolerance, tolerance or [])), relative=relative
+            *runs, dict(map(_read_tolerance, tolerance or [])), relative=relative
         )
-        found = result.lines() or ["no signal differs by more than its tolerance"]
+        differences = result.lines() or ["no signal differs by more than its tolerance"]
         if record is not None:
             from cosim.recording import record_overlay
 
-            about = "\n".join(["# A against B", "", *(f"- {text}" for text in found)])
-            sides = (f"{side}: {run.label}" for side, run in zip("AB", runs, strict=True))
-            record_overlay(record, dict(zip(sides, runs, strict=True)), about)
+            about = "\n".join(["# A against B", "", *(f"- {text}" for text in differences)])
+            overlaid = {f"A: {runs[0].label}": runs[0], f"B: {runs[1].label}": runs[1]}
+            record_overlay(record, overlaid, about)
             out_.note(f"both runs are overlaid in {record.resolve()}")
         rows = [
             (
@@ -60,13 +60,14 @@ def compare(
         ]
         header = ("signal", "unit", "largest difference", "at sample", "tolerance", "first beyond")
         out_.table(f"{a} against {b}, {min(result.samples)} samples", header, rows)
-        out_.note("\n".join(found))
+        out_.note("\n".join(differences))
         out_.json(result.document())
     if not result.equal:
         raise typer.Exit(1)
 
 
-def _tolerance(option: str) -> tuple[str, float]:
+def _read_tolerance(option: str) -> tuple[str, float]:
+    """Signal and tolerance of an option NAME=VALUE."""
     name, _, value = option.rpartition("=")
     try:
         return name, float(value)

@@ -13,9 +13,10 @@ import cosim
 from cosim.cli import output as cli
 
 SCENARIO = "fouled"
-NAIVE, LEARNED, BACKED_OFF, OPTIMAL = "naive", "learned", "tuned + back-off", "optimal"
-BACKOFF_SAMPLES = 8000
-RUNS = 10
+LEARNED = "learned"
+BACKED_OFF = "tuned + back-off"
+BACK_OFF_SAMPLES = 8000
+COMPARED_RUNS = 10
 """Runs of the comparison; the first is drawn and recorded."""
 
 
@@ -36,7 +37,7 @@ def demo(
         samples: Plant samples of learning.
     """
     with cli.output(json) as out_:
-        from cosim.cli.evaluate import show
+        from cosim.cli.evaluate import show_evaluation
         from cosim.core.files import staged, temporary_folder
         from cosim.core.trajectory import RunSignals
         from cosim.figures.style import save
@@ -49,7 +50,7 @@ def demo(
         out_.note(scenario.description)
         trained = {}
         for name, rule, start, number in (
-            (BACKED_OFF, "backoff", "tuned", BACKOFF_SAMPLES),
+            (BACKED_OFF, "backoff", "tuned", BACK_OFF_SAMPLES),
             (LEARNED, "q-learning", "tuned", samples),
         ):
             every = max(1, number // 10)
@@ -66,30 +67,30 @@ def demo(
             )
         first = 2 * HELD_OUT + seed  # noise that no training met
         with temporary_folder("cosim-demo-") as work, cosim.FmuPlant(scenario) as plant:
-            named = {NAIVE: NAIVE, BACKED_OFF: "", LEARNED: "", OPTIMAL: OPTIMAL}
+            named = {"naive": "naive", BACKED_OFF: "", LEARNED: "", "optimal": "optimal"}
             for name, training in trained.items():
                 named[name] = str(training.parameters.save(work / f"{training.run.algorithm}.toml"))
-            seeds = range(first, first + RUNS)
-            found = cosim.evaluate(scenario, named, seeds, steps, progress=out_.live)
+            seeds = range(first, first + COMPARED_RUNS)
+            evaluation = cosim.evaluate(scenario, named, seeds, steps, progress=out_.live)
             runs = {
                 name: cosim.simulate(
                     plant, cosim.build_controller(named[name], scenario), steps, first
                 )
-                for name in (NAIVE, LEARNED, OPTIMAL)
+                for name in ("naive", LEARNED, "optimal")
             }
-        summary = found.summary() | {"training": trained[LEARNED].summary()}
+        summary = evaluation.summary() | {"training": trained[LEARNED].summary()}
         signals = {
             name: RunSignals(name, run.signals, run.status, scenario.limits)
             for name, run in runs.items()
         }
         with staged(folder) as stage:
-            found.write_files(stage)
+            evaluation.write_files(stage)
             save(overlay_figure(runs), stage / "before-after.png")
             trained[LEARNED].write_files(stage)
             record_overlay(stage / "demo.rrd", signals, scenario.description)
             record_training(stage / "training.rrd", trained[LEARNED])
             cli.write_summary(stage, summary)
-        show(summary, out_)
+        show_evaluation(summary, out_)
         # `make demo` activates no environment.
         command = "cosim" if shutil.which("cosim") else f"{sys.executable} -m cosim"
         out_.note(

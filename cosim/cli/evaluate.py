@@ -47,7 +47,7 @@ def evaluate(
 
         task = cosim.Scenario.load(scenario)
         if trajectories is not None:
-            _judge(task, trajectories, cli.open_folder(out), out_)
+            _evaluate_trajectories(task, trajectories, cli.open_folder(out), out_)
             return
         names = [name for text in controllers for name in text.split(",") if name.strip()]
         named = named_controllers(names)
@@ -69,12 +69,14 @@ def evaluate(
         with staged(folder, FILES) as stage:
             evaluation.write_files(stage)
             cli.write_summary(stage, summary)
-        show(summary, out_)
+        show_evaluation(summary, out_)
         out_.note(f"files are in {folder.resolve()}")
         out_.json(summary)
 
 
-def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
+def _evaluate_trajectories(
+    scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output
+) -> None:
     from cosim.core.statistics import mean, regret, shown
     from cosim.evaluation import FILES, judge
 
@@ -99,7 +101,7 @@ def _judge(scenario: cosim.Scenario, trajectories: Path, folder: Path, output: c
     output.json(summary)
 
 
-def show(summary: dict[str, Any], output: cli.Output) -> None:
+def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
     """Print the table of controllers and the paired comparisons."""
     from cosim.core.statistics import shown
 

@@ -10,12 +10,12 @@ import typer
 
 from cosim.cli.output import JsonOption, output, split_names, writable_folder
 
-SHOWN = 1000
+MOST_ROWS = 1000
 """Variables of a table at most: a table of 200 000 takes minutes to print."""
 
-app = typer.Typer(help="Look into an FMU, check it, build ours.")
+fmu_app = typer.Typer(help="Look into an FMU, check it, build ours.")
 
-FileArgument = Annotated[
+FmuFileArgument = Annotated[
     str, typer.Argument(help="FMU file, or evaporator, evaporator_fmi3, reactor, tanks (shipped).")
 ]
 
@@ -26,8 +26,8 @@ def _path(name: str) -> Path:
     return fmus.path(name) if name in (*fmus.NAMES, *fmus.PLANTS) else Path(name)
 
 
-@app.command()
-def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
+@fmu_app.command("info")
+def show_fmu(file: FmuFileArgument = "evaporator", json: JsonOption = False) -> None:
     """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
     with output(json) as out_:
         from cosim.core.errors import PlantError
@@ -55,16 +55,16 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
         flags = [(name, *(face.get(name, "–") for face in faces)) for name in names]
         out_.table("capability flags", ("flag", *found["flags"]), flags)
         header = ("name", "causality", "unit", "start", "min", "max")
-        rows = [[str(v[key] or "") for key in header] for v in found["variables"][:SHOWN]]
+        rows = [[str(v[key] or "") for key in header] for v in found["variables"][:MOST_ROWS]]
         count = len(found["variables"])
-        more = f", the first {SHOWN} here, all with --json" if count > SHOWN else ""
+        more = f", the first {MOST_ROWS} here, all with --json" if count > MOST_ROWS else ""
         out_.table(f"{count} variables{more}", header, rows)
         out_.json(found | {"refusals": refused})
 
 
-@app.command()
-def check(
-    file: FileArgument = "evaporator",
+@fmu_app.command("check")
+def check_fmu(
+    file: FmuFileArgument = "evaporator",
     states: str = "",
     actions: str = "",
     cost: str | None = None,
@@ -107,7 +107,7 @@ def check(
         if rows:
             out_.table(str(found.fmu), header, rows)
         if found.remarks:
-            remarks = [(remark,) for remark in found.remarks[:SHOWN]]
+            remarks = [(remark,) for remark in found.remarks[:MOST_ROWS]]
             out_.table("remarks on the model description", ("remark",), remarks)
         if not json:
             print(found.verdict)
@@ -116,8 +116,8 @@ def check(
         raise typer.Exit(1)
 
 
-@app.command()
-def build(
+@fmu_app.command("build")
+def build_fmu(
     folder: Annotated[Path | None, typer.Argument(show_default="the evaporator")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
     platforms: Literal["here", "all"] = "here",

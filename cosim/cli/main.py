@@ -36,21 +36,24 @@ from cosim.core.processes import Interrupted, Terminated, command_process, unwou
 OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
 """Options whose value is an output path."""
 
-COURSE = ("log_every", "evaluate_every", "checkpoint_every", "divergence", "resume")
-PANELS = {
-    **dict.fromkeys(("out", "overwrite", "record", "png", "ssp", "json"), "Files and output"),
-    **dict.fromkeys((*COURSE, "evaluation_seeds", "evaluation_steps"), "Log and evaluation"),
-    **dict.fromkeys(("jobs", "scheduler"), "Workers"),
-}
-"""Where the help shows an option; the others are under Options."""
+OPTIONS_OF_PANELS = {
+    "Files and output": ("out", "overwrite", "record", "png", "ssp", "json"),
+    "Log and evaluation": (
+        "log_every", "evaluate_every", "checkpoint_every", "divergence", "resume",
+        "evaluation_seeds", "evaluation_steps",
+    ),
+    "Workers": ("jobs", "scheduler"),
+}  # fmt: skip
+"""Options that the help shows in a panel of their own; the others are under Options."""
+PANELS = {name: panel for panel, names in OPTIONS_OF_PANELS.items() for name in names}
 
 
 def _documentation(command: object) -> tuple[str, dict[str, str]]:
     """A command's text, with paragraphs as wide as the terminal, and those of its options."""
     text, _, options = (getdoc(command) or "").partition("\n\nArgs:\n")
     paragraphs = (paragraph.replace("\n", " ") for paragraph in text.split("\n\n"))
-    each = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", options, re.DOTALL | re.MULTILINE)
-    return "\n\n".join(paragraphs), {name: " ".join(words.split()) for name, words in each}
+    described = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", options, re.DOTALL | re.MULTILINE)
+    return "\n\n".join(paragraphs), {name: " ".join(words.split()) for name, words in described}
 
 
 class _Commands(TyperGroup):
@@ -105,7 +108,9 @@ app = typer.Typer(
     epilog="Example: cosim demo --out demo",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-RUN, LEARN, BUILD = "Run, look and compare", "Learn", "Build and hand over"
+RUN = "Run, look and compare"
+LEARN = "Learn"
+BUILD = "Build and hand over"
 for panel, function, example in (
     (RUN, demo.demo, "demo --out demo"),
     (RUN, simulate.simulate, "simulate --scenario paper --controller tuned --steps 500 --record"),
@@ -122,10 +127,17 @@ for panel, function, example in (
     text, epilog = _documentation(function)[0], f"Example: cosim {example}"
     app.command(rich_help_panel=panel, help=text, epilog=epilog)(function)
 for panel, group, name, *examples in (
-    (BUILD, scenario.app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
-    (LEARN, study.app, "study", "run mine.toml --out study", "plan mine.toml", "report study"),
-    (LEARN, study.results, "results", "check quick", "update quick", "draw quick"),
-    (BUILD, fmu.app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
+    (BUILD, scenario.scenario_app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
+    (
+        LEARN,
+        study.study_app,
+        "study",
+        "run mine.toml --out study",
+        "plan mine.toml",
+        "report study",
+    ),
+    (LEARN, study.results_app, "results", "check quick", "update quick", "draw quick"),
+    (BUILD, fmu.fmu_app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
 ):
     texts = [f"Example: cosim {name} {example}" for example in examples]
     app.add_typer(group, name=name, rich_help_panel=panel, epilog=texts[0])
@@ -183,7 +195,7 @@ def main() -> None:
     _open_streams()
     warnings.formatwarning = _format_warning
     with command_process():
-        _run()
+        _run_app()
 
 
 def _format_warning(
@@ -215,7 +227,8 @@ def _open_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _run() -> None:
+def _run_app() -> None:
+    """Run the application; any exception ends in its line and exit code."""
     try:
         app()
     except SystemExit:

@@ -43,7 +43,7 @@ def optimum(
             with cosim.FmuPlant(task) as plant:
                 plant.require_cost_of_sample()
         if change_of(task) is not None:
-            policy = QuasiStaticPolicy.from_scenario(task, progress=_told(out_))
+            policy = QuasiStaticPolicy.from_scenario(task, progress=_show_rounds(out_))
             _show_quasi_static(policy, task, out_)
             return
         document = _solve(task, refine, recompute, out_)
@@ -53,11 +53,15 @@ def optimum(
 
 
 def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cli.Output) -> None:
+    """Print J* of the plant as it is, at each value of its drifting parameters."""
     names = list(policy.law.parameters)
-    values = zip(*policy.law.parameters.values(), policy.gains, strict=True)
-    table = [dict(zip((*names, "J"), row, strict=True)) for row in values]
+    table = []
+    for k, gain in enumerate(policy.gains):
+        row = {name: values[k] for name, values in policy.law.parameters.items()}
+        table.append(row | {"J": gain})
     rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
-    rows.append(("mean", *[""] * (len(names) - 1), f"{policy.gain:.4f}"))
+    blanks = [""] * (len(names) - 1)
+    rows.append(("mean", *blanks, f"{policy.gain:.4f}"))
     title = f"quasi-static reference of {task.name}: a reference, not a bound"
     out_.table(title, (*names, "J*"), rows)
     document = {"scenario": task.name, "kind": "reference", "J": policy.gain}
@@ -74,18 +78,18 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     plant, settings = PlantProblem.from_scenario(task), Settings()
     key = store.optimum_key(plant, settings)
     path = None if refine or recompute else store.stored_file(key)
-    show = _told(out_)
-    found = store.read_optimum(path, key) if path else solve(plant, settings, progress=show)
+    show = _show_rounds(out_)
+    solution = store.read_optimum(path, key) if path else solve(plant, settings, progress=show)
     if refine:
-        found = certify(plant, settings, found, progress=show)
-    path = path or store.keep(key, found)
-    certificate = found.certificate
+        solution = certify(plant, settings, solution, progress=show)
+    path = path or store.keep(key, solution)
+    certificate = solution.certificate
     why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
     kind = "reference" if why_not else "optimum"
-    figures = certificate or [Estimate("solution", found.gain, found.lower, found.upper)]
+    figures = certificate or [Estimate("solution", solution.gain, solution.lower, solution.upper)]
     rows = [(name, *(f"{x:.4f}" for x in numbers)) for name, *numbers in figures]
-    states = " × ".join(map(str, found.grid.shape))
-    title = f"{kind} of {task.name}: J = {found.gain:.4f} on {states} states"
+    states = " × ".join(map(str, solution.grid.shape))
+    title = f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states"
     out_.table(title, ("", "J", "from", "to"), rows)
     if why_not is not None:
         out_.note(f"not called J*: {why_not}")
@@ -93,26 +97,26 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
         "scenario": task.name,
         "kind": kind,
         "objection": why_not,
-        "J": found.gain,
-        "lower": found.lower,
-        "upper": found.upper,
-        "edge_mass": found.edge_mass,
+        "J": solution.gain,
+        "lower": solution.lower,
+        "upper": solution.upper,
+        "edge_mass": solution.edge_mass,
         "file": str(path),
         "certificate": [figure._asdict() for figure in certificate] or None,
-        "states": found.grid.shape,
-        "accuracy": asdict(found.accuracy),
+        "states": solution.grid.shape,
+        "accuracy": asdict(solution.accuracy),
     }
 
 
-def _told(out_: cli.Output) -> Progress:
-    """Tell of each round on a terminal: the grid and the closing bounds."""
+def _show_rounds(out_: cli.Output) -> Progress:
+    """Note each round on a terminal: the grid and the closing bounds."""
 
-    def tell(level: int, number: int, found: Optimum) -> None:
+    def note(level: int, number: int, solution: Optimum) -> None:
         if out_.live:
-            where = f"grid {level} ({found.grid.size} states), round {number}"
-            out_.note(f"{where}: {found.lower:.1f} ≤ J* ≤ {found.upper:.1f}")
+            where = f"grid {level} ({solution.grid.size} states), round {number}"
+            out_.note(f"{where}: {solution.lower:.1f} ≤ J* ≤ {solution.upper:.1f}")
 
-    return tell
+    return note
 
 
 def tuning(

@@ -80,17 +80,16 @@ class Output:
         if not console.is_terminal:
             console.width = 1000
         columns = [[row[number] for row in rows] for number in range(len(header))]
-        # Numbers are never folded, words of a heading and texts may be.
-        widths = [
-            max(map(len, [*(cells if k else ()), *name.split(), ""])) + 3
-            for k, (name, cells) in enumerate(zip(header, columns, strict=True))
-        ]
-        widths[0] = max(map(len, [header[0], *columns[0]])) + 3
-        for part in _parts(widths, console.width - 1):
+        widths: list[int] = []
+        for name, cells in zip(header, columns, strict=True):
+            # Cells are never folded; a heading may be, but that of the first column.
+            words = name.split() if widths else [name]
+            widths.append(max(len(word) for word in [*cells, *words, ""]) + 3)
+        for part in _fitting_tables(widths, console.width - 1):
             table = Table(title=escape(title), title_justify="left", min_width=len(title))
             for k in part:
-                right = all(map(_is_number, columns[k]))
-                justify: Any = "right" if right else "left"
+                numbers = all(_is_number(cell) for cell in columns[k])
+                justify: Any = "right" if numbers else "left"
                 table.add_column(escape(header[k]), justify=justify, overflow="fold")
             for row in rows:
                 table.add_row(*(escape(row[k]) for k in part))
@@ -112,16 +111,17 @@ class Output:
             self.note(f"native code of {found.path}, sha256 {found.sha256}")
 
 
-def _parts(widths: Sequence[int], room: int) -> list[list[int]]:
+def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:
     """Columns by table, so that each table fits the room if it can; all have the first column."""
     if widths[0] > room / 2:
         return [list(range(len(widths)))]
-    parts = [[0]]
-    for column, width in list(enumerate(widths))[1:]:
-        if len(parts[-1]) > 1 and sum(widths[k] for k in parts[-1]) + width > room:
-            parts.append([0])
-        parts[-1].append(column)
-    return parts
+    tables = [[0]]
+    for column in range(1, len(widths)):
+        width = widths[column] + sum(widths[k] for k in tables[-1])
+        if len(tables[-1]) > 1 and width > room:
+            tables.append([0])
+        tables[-1].append(column)
+    return tables
 
 
 def _is_number(cell: str) -> bool:

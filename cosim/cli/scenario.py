@@ -26,13 +26,13 @@ class ShowByDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(
+scenario_app = typer.Typer(
     cls=ShowByDefault, help="Show scenarios (cosim scenario NAME), or draft one for an FMU."
 )
 
 
-@app.command()
-def show(
+@scenario_app.command("show")
+def show_scenario(
     name: Annotated[str | None, typer.Argument()] = None,
     seed: Annotated[int | None, typer.Option("--seed-values", min=0)] = None,
     json: cli.JsonOption = False,
@@ -74,8 +74,8 @@ def _seed_values(scenario: cosim.Scenario, seed: int) -> dict[str, float | bool 
     return {name: types.get(kind, int)(value) for name, (kind, value) in starts.items()}
 
 
-@app.command()
-def init(
+@scenario_app.command("init")
+def draft(
     fmu: str,
     out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
     states: str = "",
@@ -123,18 +123,27 @@ def init(
             state=_numbers(state, "--state"),
             action=_numbers(action, "--action"),
         )
-        write_atomically(target, text)
-        drafted = cosim.Scenario.load(target)
+        drafted = _parsed(text, target)
         if drafted.controller.model is not None:
             text = _with_enough_substeps(text, drafted)
-            write_atomically(target, text)
-            drafted = cosim.Scenario.load(target)
+        write_atomically(target, text)
+        drafted = cosim.Scenario.load(target)
         if not json:
             print(text, end="")
         if drafted.disturbance.law == "none":
             out_.note(NO_NOISE)
         out_.note(f"written to {target}: read the lines with CHECK")
         out_.json({"file": str(target), **drafted.to_dict(), "hash": drafted.hash})
+
+
+def _parsed(text: str, target: Path) -> cosim.Scenario:
+    """The scenario of a file that is not written yet."""
+    from tomllib import loads
+
+    from cosim.core.scenario import resolved
+
+    where = f"the draft of '{target}'"
+    return cosim.Scenario.from_dict(resolved(loads(text), where, target.parent), where)
 
 
 def _with_enough_substeps(text: str, scenario: cosim.Scenario) -> str:

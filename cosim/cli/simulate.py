@@ -10,9 +10,9 @@ import typer
 import cosim
 from cosim.cli import output as cli
 
-DRAWN = 20_000
+MOST_DRAWN = 20_000
 """Samples of the longest run that is drawn: more are a grey band, and take seconds."""
-FILES = (
+SIMULATION_FILES = (
     "trajectory.csv", "trajectory.png", "timing.csv", "summary.json", "scenario.toml", "run.rrd",
 )  # fmt: skip
 """Files of a run; all in a folder belong to one."""
@@ -48,8 +48,8 @@ def simulate(
         loaded = cosim.Scenario.load(scenario)
         folder = cli.open_folder(out)
         out_.announce(loaded.plant.fmu)
-        with staged(folder, FILES) as stage:
-            summary = _run(loaded, controller, steps, seed, stage, record, out_.live)
+        with staged(folder, SIMULATION_FILES) as stage:
+            summary = _simulate(loaded, controller, steps, seed, stage, record, out_.live)
             cli.write_summary(stage, summary)
         rows = [
             ("economic cost", f"{summary['economic_cost']:.3f}"),
@@ -71,7 +71,7 @@ def simulate(
             raise PlantError(f"{ended}; they are in {out.resolve()}")
 
 
-def _run(
+def _simulate(
     scenario: cosim.Scenario,
     controller: str,
     steps: int,
@@ -123,7 +123,7 @@ def _run(
         summary["ended"] = ended
     run.write_csv(folder / "trajectory.csv")
     run.write_timing_csv(folder / "timing.csv")
-    if 1 < len(run) <= DRAWN:
+    if 1 < len(run) <= MOST_DRAWN:
         run.plot(folder / "trajectory.png")
     (folder / "scenario.toml").write_text(scenario.to_toml(), "utf-8")
     return summary

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,18 +10,18 @@ import typer
 import cosim
 from cosim.cli import output as cli
 
-app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
-results = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
+study_app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
+results_app = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
 
-FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+StudyFileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 NamesArgument = Annotated[
     list[str] | None, typer.Argument(help="Studies; default: all that apply.")
 ]
 
 
-@app.command()
-def run(
-    file: FileArgument,
+@study_app.command("run")
+def run_study(
+    file: StudyFileArgument,
     out: cli.OutOption = Path("cosim-study"),
     jobs: cli.JobsOption = None,
     scheduler: cli.SchedulerOption = None,
@@ -35,11 +34,11 @@ def run(
     file: what is finished is not done again. Exit code 1: some runs failed, all others are done.
     """
     with cli.output(json) as out_:
-        found = _execute(file, out, out_, jobs=jobs, scheduler=scheduler)
-        _show(found, out_)
+        results = _execute(file, out, out_, jobs=jobs, scheduler=scheduler)
+        _show_tables(results, out_)
         out_.note(f"tables are in {out.resolve()}; cosim study report {out} draws them")
-        summary = _summary(found)
-        cli.write_summary(found.folder, summary)
+        summary = _summary(results)
+        cli.write_summary(results.folder, summary)
         out_.json(summary)
 
 
@@ -79,8 +78,8 @@ def _execute(
             raise typer.Exit(1) from None
 
 
-@app.command("plan")
-def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
+@study_app.command("plan")
+def show_plan(file: StudyFileArgument, json: cli.JsonOption = False) -> None:
     """Show the runs of a study and the plant samples that they take: nothing is run or written."""
     with cli.output(json) as out_:
         import pandas as pd
@@ -101,8 +100,8 @@ def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
         out_.json({"runs": len(planned.runs), "samples": planned.samples})
 
 
-@app.command()
-def report(
+@study_app.command("report")
+def report_study(
     folder: Path,
     columns: str | None = None,
     json: cli.JsonOption = False,
@@ -119,34 +118,40 @@ def report(
             difference, p; default: case,rank,regret,worst,finished.
     """
     with cli.output(json) as out_:
-        found = cosim.StudyResults.load(folder)
-        page = found.report()
-        _show(found, out_, columns)
+        results = cosim.StudyResults.load(folder)
+        page = results.report()
+        _show_tables(results, out_, columns)
         out_.note(f"the report is {page.resolve()}")
-        out_.json({"report": str(page), "runs": len(found.runs)})
+        out_.json({"report": str(page), "runs": len(results.runs)})
 
 
-def _summary(found: cosim.StudyResults) -> dict[str, Any]:
+def _summary(results: cosim.StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is timing.csv by run."""
     from cosim.evaluation import TIMING
     from cosim.studies.run import read_table
 
-    timing = read_table(found.folder / TIMING, needed=["run"])
+    timing = read_table(results.folder / TIMING, needed=["run"])
     return {
-        **found.about,
-        "summary": found.summary.to_dict("records"),
-        "aggregate": found.aggregate.to_dict("records"),
+        **results.about,
+        "summary": results.summary.to_dict("records"),
+        "aggregate": results.aggregate.to_dict("records"),
         "timing": timing.set_index("run").to_dict("index"),
     }
 
 
-def _show(found: cosim.StudyResults, out_: cli.Output, columns: str | None = None) -> None:
+def _show_tables(results: cosim.StudyResults, out_: cli.Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
     from cosim.studies.report import COLUMNS, SHORT
 
-    chosen = COLUMNS if columns == "all" else columns.split(",") if columns else SHORT
-    for scenario in found.scenarios:
-        out_.table(f"{found.name}: {scenario}", *found.lines(scenario, tuple(chosen)))
+    if columns is None:
+        names = list(SHORT)
+    elif columns == "all":
+        names = list(COLUMNS)
+    else:
+        names = columns.split(",")
+    for scenario in results.scenarios:
+        header, rows = results.lines(scenario, names)
+        out_.table(f"{results.name}: {scenario}", header, rows)
 
 
 def reproduce(
@@ -168,18 +173,18 @@ def reproduce(
         from cosim.studies.stored import stored_results
 
         name = "reproduce" if budget == "quick" else "reproduce-full"
-        found = _execute(stored_results() / f"{name}.toml", out, out_, jobs=jobs)
-        page = found.report()
-        _show(found, out_)
-        out_.table(*found.paper())
+        results = _execute(stored_results() / f"{name}.toml", out, out_, jobs=jobs)
+        page = results.report()
+        _show_tables(results, out_)
+        out_.table(*results.paper())
         out_.note(f"the report is {page.resolve()}")
-        summary = _summary(found)
-        cli.write_summary(found.folder, summary)
+        summary = _summary(results)
+        cli.write_summary(results.folder, summary)
         out_.json(summary)
 
 
-@results.command()
-def check(
+@results_app.command("check")
+def check_results(
     names: NamesArgument = None,
     folder: Annotated[Path | None, typer.Option("--results")] = None,
     jobs: cli.JobsOption = None,
@@ -200,29 +205,37 @@ def check(
 
         local = Path("results")
         folder = folder or (local if local.is_dir() else stored.stored_results())
-        studies, tolerances = stored.stored_studies(folder), stored.load_tolerances(folder)
-        checked = [name for name, table in studies.items() if table.check]
-        quick = stored.chosen(studies, names or checked)
-        for name in quick:
+        studies = stored.stored_studies(folder)
+        tolerances = stored.load_tolerances(folder)
+        regression = [name for name, table in studies.items() if table.check]
+        chosen = stored.chosen(studies, names or regression)
+        for name in chosen:
             cosim.StudyResults.load(folder / name)
             stored.compared_tables(folder / name)  # an unknown table is refused before the work
-        found: dict[str, list[str]] = {}
+        differences: dict[str, list[str]] = {}
         with temporary_folder("cosim-results-") as work:
-            for name in quick:
-                _execute(folder / f"{name}.toml", work / name, out_, jobs=jobs, figures=False)
-                found[name] = stored.differences(name, folder / name, work / name, tolerances)
-        verdicts = {name: "differs" if lines else "same" for name, lines in found.items()}
-        rows = [(name, verdicts.get(name, "not recomputed")) for name in studies]
+            for name in chosen:
+                now = work / name
+                _execute(folder / f"{name}.toml", now, out_, jobs=jobs, figures=False)
+                differences[name] = stored.differences(name, folder / name, now, tolerances)
+        rows = []
+        for name in studies:
+            verdict = "not recomputed"
+            if name in differences:
+                verdict = "differs" if differences[name] else "same"
+            rows.append((name, verdict))
         out_.table("stored studies", ("study", "verdict"), rows)
-        for line in chain(*found.values()):
-            out_.note(line)
-        out_.json({"same": not any(found.values()), "differences": found})
-    if any(found.values()):
+        for lines in differences.values():
+            for line in lines:
+                out_.note(line)
+        same = not any(differences.values())
+        out_.json({"same": same, "differences": differences})
+    if not same:
         raise typer.Exit(1)
 
 
-@results.command()
-def update(
+@results_app.command("update")
+def update_results(
     names: NamesArgument = None,
     folder: Annotated[Path, typer.Option("--results")] = Path("results"),
     jobs: cli.JobsOption = None,
@@ -249,8 +262,8 @@ def update(
         out_.json({"updated": list(names or studies)})
 
 
-@results.command()
-def draw(
+@results_app.command("draw")
+def draw_results(
     names: NamesArgument = None,
     folder: Annotated[Path, typer.Option("--results")] = Path("results"),
     json: cli.JsonOption = False,
@@ -269,6 +282,6 @@ def draw(
         kept = [name for name in studies if (folder / name).is_dir()]
         drawn = {}
         for name in stored.chosen(studies, names or kept):
-            drawn[name] = stored.draw(folder, name)
+            drawn[name] = stored.draw_stored(folder, name)
             out_.note(f"{name}: {len(drawn[name])} figures in {folder / name / 'figures'}")
         out_.json({"figures": drawn})

@@ -120,7 +120,7 @@ def train(
 
                 record_training(stage / "training.rrd", training)
             cli.write_summary(stage, summary)
-        _show(summary, out_)
+        _show_training(summary, out_)
         out_.note(f"the learning curve is {folder / 'learning.png'}")
         out_.json(summary)
     if training.status != "finished":
@@ -137,7 +137,7 @@ def _explain(algorithm: str, hyperparameters: Sequence[Hyperparameter], output: 
     output.json(document)
 
 
-def _show(summary: dict[str, Any], output: cli.Output) -> None:
+def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
     from cosim.core.statistics import shown
 
     title = (

@@ -111,7 +111,7 @@ def load_plugin(
             plugin: Any = importlib.import_module(module)
             place = _place(module) if foreign else None
             if place is not None:
-                _loaded.setdefault(place, _sources_hash(place))
+                _hash_when_loaded(place)
         for part in attribute.split("."):
             plugin = getattr(plugin, part)
     # A module may raise anything while it is imported, and one that is a script may even exit.
@@ -155,7 +155,7 @@ def code_of(module: str) -> str | None:
     installed = bool(INSTALLED & set(place.parts))
     if not installed and any(place.is_relative_to(folder) for folder in PYTHON):
         return None
-    code = _loaded.setdefault(place, _sources_hash(place))
+    code = _hash_when_loaded(place)
     words = []
     if installed:
         for name in _distributions().get(top, []):
@@ -185,6 +185,14 @@ def _place(module: str) -> Path | None:
         return folder
     # Of an installed one the package alone: its folder holds all that is installed.
     return path.parents[depth - 1] if depth else path
+
+
+def _hash_when_loaded(place: Path) -> str:
+    """Hash of the sources at a place, as of the time when its modules were first loaded."""
+    # Reading them takes some 50 ms of a folder with 500 modules: not again for each question.
+    if place not in _loaded:
+        _loaded[place] = _sources_hash(place)
+    return _loaded[place]
 
 
 def _forget_edited_modules() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +26,20 @@ from cosim.figures.style import BOUND, DASHED, DotRow, EndLabel, LineStyle, pale
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.measurement import built
-from cosim.studies.operation import Judged
-from cosim.studies.plan import Plan
+from cosim.studies.operation import OperationLayout, OperationResult
+from cosim.studies.plan import StudyPlan
 from cosim.studies.report import FOLDER
-from cosim.studies.run import LOG, PARAMETERS, Run, read_table, safe
+from cosim.studies.run import LOG, PARAMETERS, Run, folder_name, read_table
 
 BANDED = 6
 """Largest number of curves with bands in a panel: more cannot be told apart."""
 Policy = Callable[[Array], Array]
-PREFIX = "theta "
-GRID, BINS = 13, 80
+THETA_PREFIX = "theta "
+"""Of the columns of a log that hold θ."""
+GRID = 13
+"""Points of a phase portrait's arrows in each direction."""
+BINS = 80
+"""Bins of a density, at most."""
 
 
 def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Figure:
@@ -42,12 +47,17 @@ def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Fi
 
     A run that diverged is a cross; an interval that goes on to the left of the axes ends in an
     arrow. The least middle is first; the axis is logarithmic above 0.01 %.
+
+    Args:
+        rows: regrets of each case, in %.
+        styles: line style of each case.
     """
     rows = sorted(rows, key=lambda row: row.middle)
     with style.figure(0.21 * len(rows) + 0.9) as drawn:
         axes = drawn.subplots()
         values = style.dot_rows(axes, rows, styles)
-        style.regret_axis(axes, "x", np.append(values, [0.0, *(row.high for row in rows)]))
+        upper_ends = [row.high for row in rows]
+        style.regret_axis(axes, "x", np.append(values, [0.0, *upper_ends]))
         left = axes.get_xlim()[0]
         cut = [y for y, row in enumerate(rows) if row.low < left]
         axes.plot([left] * len(cut), cut, "<", color=style.INK, markersize=3, clip_on=False)
@@ -55,29 +65,53 @@ def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Fi
     return drawn
 
 
-def learning_curve(log: pd.DataFrame, best: float | None) -> dict[str, Array]:
-    """R runs of a case at their K greedy evaluations, as regret in % where J* is known.
+@dataclass(frozen=True)
+class LearningCurve:
+    """R runs of a case at their K greedy evaluations.
 
-    `samples` (K,); `training` (R, K), the mean cost of the training samples since the point before;
-    `greedy` (R, K), that of the policy learnt so far. `log` has rows (training_seed, samples, J,
-    greedy_J). A run that diverged is held at its last point.
+    Attributes:
+        samples: plant samples of the training, (K,).
+        training: mean cost of the training samples since the point before, (R, K).
+        greedy: mean cost of the policy learned so far, (R, K).
+    """
+
+    samples: Array
+    training: Array
+    greedy: Array
+
+
+def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
+    """The learning curve of a case, of which a run that diverged stays at its last point.
+
+    Args:
+        log: rows (training_seed, samples, J, greedy_J); greedy_J is NaN between evaluations.
+        best: J*; costs are then regrets in %.
     """
     runs = []
     for _, rows in log.groupby("training_seed", sort=False):
-        # Rows up to a greedy evaluation belong to it.
-        point = -rows.greedy_J.notna()[::-1].cumsum()[::-1]
-        at = rows[rows.greedy_J.notna()]
-        costs = rows.J.groupby(point).mean().iloc[: len(at)]
-        runs.append(np.array([at.samples, costs, at.greedy_J], dtype=np.float64))
+        evaluated = rows.greedy_J.notna()
+        # Rows up to a greedy evaluation belong to it: number them by the evaluations that follow.
+        evaluations_left = evaluated[::-1].cumsum()[::-1]
+        costs = rows.J.groupby(-evaluations_left).mean().iloc[: evaluated.sum()]
+        points = [rows.samples[evaluated], costs, rows.greedy_J[evaluated]]
+        runs.append(np.array(points, dtype=np.float64))
     longest = max(runs, key=lambda run: run.shape[1])
-    count = longest.shape[1]
-    held = np.array([np.pad(run, ((0, 0), (0, count - run.shape[1])), mode="edge") for run in runs])
-    shown = held[:, 1:] if best is None else 100 * regrets(held[:, 1:], best)
-    return {"samples": longest[0], "training": shown[:, 0], "greedy": shown[:, 1]}
+    n_points = longest.shape[1]
+    training = np.array([_padded(run[1], n_points) for run in runs])
+    greedy = np.array([_padded(run[2], n_points) for run in runs])
+    if best is not None:
+        training = 100 * regrets(training, best)
+        greedy = 100 * regrets(greedy, best)
+    return LearningCurve(longest[0], training, greedy)
+
+
+def _padded(values: Array, length: int) -> Array:
+    """Values followed by the last of them, (length,)."""
+    return np.pad(values, (0, length - len(values)), mode="edge")
 
 
 def curves_figure(
-    curves: Mapping[str, Mapping[str, Array]],
+    curves: Mapping[str, LearningCurve],
     levels: Mapping[str, float],
     styles: Mapping[str, LineStyle],
     *,
@@ -86,52 +120,85 @@ def curves_figure(
     """Above the cost of the training samples, below the greedy policy's.
 
     More than six cases have a column for each θ that they start from. Lines are medians over runs,
-    bands their quartiles, drawn where at most six cases are in a panel. `levels` are drawn across
-    all panels, by name. `relative` values are regrets in %.
+    bands their quartiles, drawn where at most six cases are in a panel.
+
+    Args:
+        curves: curve of each case.
+        levels: costs that are drawn across all panels, by name.
+        styles: line style of each case.
+        relative: whether costs are regrets in %.
     """
     unit = "regret %" if relative else "J"
     height = max(2.6, 0.135 * (len(curves) + len(levels)))
     starts = _by_start(curves)
     if len(curves) <= BANDED or not 1 < len(starts) < BANDED:
         starts = {"": list(curves)}
-    handles: dict[str, Line2D] = {}
+    legend: dict[str, Line2D] = {}
     with style.figure(2 * height + 0.4) as drawn:
         grid = drawn.subplots(2, len(starts), sharex=True, sharey="row", squeeze=False)
-        named: list[tuple[Axes, list[EndLabel]]] = []
+        labels: list[tuple[Axes, list[EndLabel]]] = []
         for row, kind in zip(grid, ("training samples", "greedy policy"), strict=True):
             for axes, (start, names) in zip(row, starts.items(), strict=True):
-                lines, own = [], palette(names)
-                for name in names:
-                    curve, values = curves[name], curves[name][kind.split()[0]]
-                    finite = np.isfinite(values).all(axis=0)
-                    samples, values = curve["samples"][finite], values[:, finite]
-                    if not values.size:
-                        continue
-                    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
-                    color, line = styles[name].color, (own if start else styles)[name].line
-                    look: Any = {"color": color, "linestyle": line, "linewidth": 1.3}
-                    lines.append((name, samples, middle, look))
+                panel = {name: curves[name] for name in names}
+                # Beside other panels a case's line says its rule alone.
+                lines = palette(names) if start else styles
+                costs = {
+                    name: curve.training if kind == "training samples" else curve.greedy
+                    for name, curve in panel.items()
+                }
+                medians = _draw_bands(axes, panel, costs, styles, lines)
+                for name, _, _, look in medians:
                     rule = shown_case(name).replace(start.replace("from", ","), "")
-                    handles.setdefault(rule, Line2D([], [], label=rule, **look))
-                    if len(values) > 1 and len(names) <= BANDED:
-                        axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
-                ends = style.cost_lines(axes, lines, levels, relative=relative)
+                    legend.setdefault(rule, Line2D([], [], label=rule, **look))
+                ends = style.cost_lines(axes, medians, levels, relative=relative)
                 if axes is row[-1]:
-                    named.append((axes, ends[: len(levels)] if start else ends))
-                axes.set_title(start if kind.startswith("training") else "")
+                    # The legend below names the rules of several panels.
+                    labels.append((axes, ends[: len(levels)] if start else ends))
+                axes.set_title(start if kind == "training samples" else "")
             if relative:
-                style.regret_axis(
-                    row[0], "y", np.concatenate([axes.dataLim.intervaly for axes in row])
-                )
+                intervals = [axes.dataLim.intervaly for axes in row]
+                style.regret_axis(row[0], "y", np.concatenate(intervals))
             row[0].set_ylabel(f"{unit} of the {kind}")
-        end = max(float(curve["samples"][-1]) for curve in curves.values())
+        end = max(float(curve.samples[-1]) for curve in curves.values())
         for axes in grid[1]:
             style.samples_axis(axes, end, "training samples")
         if len(starts) > 1:
-            columns = max(1, 132 // (max(map(len, handles)) + 10))  # of characters across the page
-            drawn.legend(handles=[*handles.values()], loc="outside lower center", ncols=columns)
-        style.label_ends(drawn, named)
+            widest = max(len(rule) for rule in legend)
+            columns = max(1, 132 // (widest + 10))  # of characters across the page
+            drawn.legend(handles=[*legend.values()], loc="outside lower center", ncols=columns)
+        style.label_ends(drawn, labels)
     return drawn
+
+
+def _draw_bands(
+    axes: Axes,
+    curves: Mapping[str, LearningCurve],
+    costs: Mapping[str, Array],
+    styles: Mapping[str, LineStyle],
+    lines: Mapping[str, LineStyle],
+) -> list[tuple[str, Array, Array, dict[str, Any]]]:
+    """Draw quartiles of the costs over the runs; return the medians as `cost_lines` takes them.
+
+    Args:
+        axes: where they are drawn.
+        curves: curve of each case, for its samples.
+        costs: costs (R, K) of each case.
+        styles: of which the colours are taken.
+        lines: of which the dashes are taken.
+    """
+    medians = []
+    for name, curve in curves.items():
+        finite = np.isfinite(costs[name]).all(axis=0)
+        samples, values = curve.samples[finite], costs[name][:, finite]
+        if not values.size:
+            continue
+        low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
+        color = styles[name].color
+        look: dict[str, Any] = {"color": color, "linestyle": lines[name].line, "linewidth": 1.3}
+        medians.append((name, samples, middle, look))
+        if len(values) > 1 and len(curves) <= BANDED:
+            axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
+    return medians
 
 
 def _by_start(names: Iterable[str]) -> dict[str, list[str]]:
@@ -144,62 +211,96 @@ def _by_start(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def operation_figure(
-    found: Judged,
-    about: Mapping[str, Any],
+    result: OperationResult,
+    layout: OperationLayout,
     styles: Mapping[str, LineStyle],
     baselines: Sequence[str],
 ) -> Figure:
-    """Greedy regret and regret so far against the plant's samples, on log axes.
+    """Greedy regret and regret of the whole run against the plant's samples, on log axes.
 
-    Lines are medians over the training seeds, bands from the best to the worst; `baselines` are
-    dashed and have no bands; `about` may name the cases that are `drawn`. Vertical lines stand at
-    an hour, a shift, a day, a week.
+    Lines are medians over the training seeds, bands from the best to the worst. Vertical lines
+    stand at an hour, a shift, a day, a week.
+
+    Args:
+        result: the regrets of all runs.
+        layout: the plant's sampling time, and the cases that are drawn.
+        styles: line style of each case.
+        baselines: cases with a dashed line and no band.
     """
-    named = {"hour": 1, "shift": 8, "day": 24, "week": 168}
-    lives, h = found.lives, about["sampling_time"]
-    lives = lives[lives.case.isin(about["drawn"] or lives.case)]
-    lines = palette(list(map(str, lives.case.unique())))
+    runs = result.runs
+    if layout.drawn:
+        runs = runs[runs.case.isin(layout.drawn)]
+    lines = palette([str(case) for case in runs.case.unique()])
+    first, last = float(runs.samples.min()), float(runs.samples.max())
+    titles = {
+        "regret": "regret % of θ at that time",
+        "life_regret": "regret % of all samples so far",
+    }
+    all_regrets = 100 * runs[list(titles)].to_numpy(dtype=np.float64)
     with style.figure(3.4) as drawn:
         panels = drawn.subplots(1, 2, sharey=True)
-        titles = ("regret % of θ at that time", "regret % of all samples so far")
-        reached = 100 * lives[["regret", "life_regret"]].to_numpy(dtype=np.float64)
-        for axes, name, title in zip(panels, ("regret", "life_regret"), titles, strict=True):
-            ends = []
-            for case, rows in lives.groupby("case", sort=False):
-                runs = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
-                color, line = styles[str(case)].color, lines[str(case)].line
-                known = case in baselines
-                dashes, width = (DASHED, 0.9) if known else (line, 1.5)
-                axes.plot(runs.index, runs["median"], c=color, ls=dashes, lw=width)
-                if not known:
-                    band = runs["min"], runs["max"]
-                    axes.fill_between(runs.index, *band, color=color, alpha=0.12, lw=0)
-                ends.append(EndLabel(shown_case(str(case)), float(runs["median"].iloc[-1]), color))
+        for axes, (name, title) in zip(panels, titles.items(), strict=True):
+            labels = []
+            for case, rows in runs.groupby("case", sort=False):
+                spread = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
+                color = styles[str(case)].color
+                if case in baselines:
+                    axes.plot(spread.index, spread["median"], c=color, ls=DASHED, lw=0.9)
+                else:
+                    line = lines[str(case)].line
+                    axes.plot(spread.index, spread["median"], c=color, ls=line, lw=1.5)
+                    axes.fill_between(
+                        spread.index, spread["min"], spread["max"], color=color, alpha=0.12, lw=0
+                    )
+                end = float(spread["median"].iloc[-1])
+                labels.append(EndLabel(shown_case(str(case)), end, color))
             axes.set_xscale("log")
-            first, end = float(lives.samples.min()), float(lives.samples.max())
-            axes.set_xlim(first, end)
+            axes.set_xlim(first, last)
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.xaxis.set_minor_formatter(NullFormatter())
-            style.regret_axis(axes, "y", reached)
-            for text, hours in named.items():
-                if first <= (samples := hours * 3600.0 / h) <= end:
-                    part = np.log(samples / first) / np.log(end / first)
-                    side = "left" if part < 0.06 else "right" if part > 0.94 else "center"
-                    axes.axvline(
-                        samples, color=style.REFERENCE, linewidth=0.7, linestyle=(0, (1, 2))
-                    )
-                    axes.annotate(
-                        text, (samples, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
-                        textcoords="offset points", ha=side, fontsize=6.5, color=style.REFERENCE,
-                    )  # fmt: skip
+            style.regret_axis(axes, "y", all_regrets)
+            _mark_times(axes, layout.sampling_time, first, last)
             axes.set_title(title, pad=12)
             axes.set_xlabel("samples of the plant")
-        style.label_ends(drawn, [(panels[1], ends)])
+        style.label_ends(drawn, [(panels[1], labels)])
     return drawn
 
 
-def draw(plan: Plan, out: Path, formats: Sequence[str] = style.FORMATS) -> list[str]:
+def _mark_times(axes: Axes, sampling_time: float, first: float, last: float) -> None:
+    """Draw a line at an hour, a shift, a day and a week of samples, on a log axis.
+
+    Args:
+        axes: where they are drawn.
+        sampling_time: of the plant, in s.
+        first: least sample of the axis.
+        last: largest sample of the axis.
+    """
+    for name, hours in {"hour": 1, "shift": 8, "day": 24, "week": 168}.items():
+        samples = hours * 3600.0 / sampling_time
+        if not first <= samples <= last:
+            continue
+        # Near an edge the name is set inwards.
+        share = np.log(samples / first) / np.log(last / first)
+        side = "center"
+        if share < 0.06:
+            side = "left"
+        elif share > 0.94:
+            side = "right"
+        axes.axvline(samples, color=style.REFERENCE, linewidth=0.7, linestyle=(0, (1, 2)))
+        axes.annotate(
+            name,
+            (samples, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha=side,
+            fontsize=6.5,
+            color=style.REFERENCE,
+        )
+
+
+def draw_kept(plan: StudyPlan, out: Path, formats: Sequence[str] = style.FORMATS) -> list[str]:
     """Draw the trajectories and logs that a study keeps.
 
     Args:
@@ -213,48 +314,64 @@ def draw(plan: Plan, out: Path, formats: Sequence[str] = style.FORMATS) -> list[
     Raises:
         StudyError: if a phase portrait needs θ of a training that `out` does not hold.
     """
-    return style.save_set(_figures(plan, out), out / FOLDER, formats)
+    drawn = chain(_trajectory_figures(plan, out), _training_figures(plan, out))
+    return style.save_set(drawn, out / FOLDER, formats)
 
 
-def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
+def _trajectory_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]]:
+    """Names and figures of the kept trajectories."""
     for name, scenario in plan.definition.scenarios.items():
         for table in plan.definition.table.trajectory:
-            runs = {
-                run.case: run
-                for run in plan.runs
-                if run.scenario.name == name and (out / run.kept.get(table.file, "?")).is_file()
-            }
-            found = {
-                case: replace(read_csv(out / run.kept[table.file], scenario), controller=case)
-                for case, run in runs.items()
-            }
-            for kind in table.figures if found else ():
-                stem = f"{kind}-{safe(name)}-{table.name}"
+            runs: dict[str, Run] = {}
+            trajectories: dict[str, Trajectory] = {}
+            for run in plan.runs:
+                kept = run.kept.get(table.file)
+                if run.scenario.name != name or kept is None or not (out / kept).is_file():
+                    continue
+                runs[run.case] = run
+                trajectory = read_csv(out / kept, scenario)
+                trajectories[run.case] = replace(trajectory, controller=run.case)
+            if not trajectories:
+                continue
+            for kind in table.figures:
+                stem = f"{kind}-{folder_name(name)}-{table.name}"
                 if kind == "trajectory":
-                    for case, one in found.items():
-                        drawn = trajectory_figure(one, scenario, beside=[*found.values()])
-                        yield f"{stem}-{safe(case)}", drawn
+                    beside = list(trajectories.values())
+                    for case, trajectory in trajectories.items():
+                        drawn = trajectory_figure(trajectory, scenario, beside=beside)
+                        yield f"{stem}-{folder_name(case)}", drawn
                 elif kind == "overlay":
-                    yield stem, overlay_figure(found)
+                    yield stem, overlay_figure(trajectories)
                 elif kind == "density":
-                    yield stem, density_figure(found, scenario)
+                    yield stem, density_figure(trajectories, scenario)
                 else:
                     policies = {case: _policy(run, out) for case, run in runs.items()}
-                    yield stem, phase_figure(found, policies, scenario)
-    for path in (out / run.kept.get(LOG, "?") for run in plan.runs if not run.marks):
-        if path.is_file() and (blocks := increments(log := read_table(path))):
-            columns = (log[name].to_numpy(float) for name in ("samples", "td_error", "updates"))
-            samples, td_error, updates = columns
-            error = td_error_mean(samples, td_error, updates)
-            yield f"parameters-{path.stem}", parameters_figure(samples, blocks, error)
+                    yield stem, phase_figure(trajectories, policies, scenario)
+
+
+def _training_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]]:
+    """Names and figures of the kept logs; a run in operation has none."""
+    for run in plan.runs:
+        kept = run.kept.get(LOG)
+        if run.marks or kept is None or not (out / kept).is_file():
+            continue
+        log = read_table(out / kept)
+        if blocks := increments(log):
+            samples = log["samples"].to_numpy(float)
+            updates = log["updates"].to_numpy(float)
+            error = td_error_mean(samples, log["td_error"].to_numpy(float), updates)
+            yield f"parameters-{Path(kept).stem}", parameters_figure(samples, blocks, error)
 
 
 def increments(log: pd.DataFrame) -> dict[str, Array]:
-    """θ less its first row by block, (K, entries), of a training's log."""
-    theta = log.filter(like=PREFIX).astype(float)
-    moved = (theta - theta.iloc[0]).T
-    blocks = [str(name).removeprefix(PREFIX).partition("[")[0] for name in theta]
-    return {str(block): own.to_numpy().T for block, own in moved.groupby(blocks, sort=False)}
+    """θ less its first row by block, (K, entries), of a training's log of K rows."""
+    theta = log.filter(like=THETA_PREFIX).astype(float)
+    changes = theta - theta.iloc[0]
+    columns: dict[str, list[Array]] = {}
+    for name in theta:
+        block = str(name).removeprefix(THETA_PREFIX).partition("[")[0]
+        columns.setdefault(block, []).append(changes[name].to_numpy())
+    return {block: np.column_stack(values) for block, values in columns.items()}
 
 
 def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure:
@@ -262,27 +379,23 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
 
     The bins are common and an edge lies on the bound, so that no bin mixes both sides; the axis
     leaves out the outermost 0.1 % of all samples. The legend gives the share that violates it.
+
+    Args:
+        runs: trajectory of each controller.
+        scenario: of the plant.
     """
-    name, bound = scenario.plant.states[0], float(scenario.state_lower[0])
+    name = scenario.plant.states[0]
+    bound = float(scenario.state_lower[0])
     unit = next(iter(runs.values())).signals[name].unit
     samples = {case: run[name] for case, run in runs.items()}
-    low, high = np.quantile(np.concatenate([*samples.values()]), (0.001, 0.999))
-    low, high = min(float(low), bound), max(float(high), bound)
-    # Not narrower than the smallest sample can fill (Freedman and Diaconis' rule).
-    spans = [
-        float(2 * np.subtract(*np.quantile(values, (0.75, 0.25))) / np.cbrt(len(values)))
-        for values in samples.values()
-    ]
-    width = max((high - low) / BINS, *spans) or 1e-3 * max(abs(bound), 1.0)
-    edges = bound + width * np.arange(
-        -np.ceil((bound - low) / width) - 1, np.ceil((high - bound) / width) + 2
-    )
+    edges, width = _common_bins(list(samples.values()), bound)
     styles = palette(list(samples))
     with style.figure(2.9, 4.6) as drawn:
         axes = drawn.subplots()
         for case, values in samples.items():
             share = 100 * float(np.mean(bound - values > VIOLATING))
-            heights = np.histogram(values, edges)[0] / (len(values) * width)
+            counts = np.histogram(values, edges)[0]
+            heights = counts / (len(values) * width)
             color = styles[case].color
             axes.stairs(heights, edges, fill=True, alpha=0.12, color=color)
             text = f"{shown_case(case)}: {share:.1f} % below"
@@ -297,6 +410,23 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
     return drawn
 
 
+def _common_bins(samples: Sequence[Array], bound: float) -> tuple[Array, float]:
+    """Edges of bins for several histograms, of which one is `bound`, and the bins' width."""
+    low, high = np.quantile(np.concatenate(samples), (0.001, 0.999))
+    low, high = min(float(low), bound), max(float(high), bound)
+    width = (high - low) / BINS
+    for values in samples:
+        # Not narrower than the smallest sample can fill (Freedman and Diaconis' rule).
+        spread = np.subtract(*np.quantile(values, (0.75, 0.25)))
+        width = max(width, float(2 * spread / np.cbrt(len(values))))
+    if not width:  # all samples are one number
+        width = 1e-3 * max(abs(bound), 1.0)
+    below = -np.ceil((bound - low) / width) - 1
+    above = np.ceil((high - bound) / width) + 2
+    edges: Array = bound + width * np.arange(below, above)
+    return edges, width
+
+
 def phase_figure(
     runs: Mapping[str, Trajectory], policies: Mapping[str, Policy], scenario: Scenario
 ) -> Figure:
@@ -305,29 +435,32 @@ def phase_figure(
     Background: density of the visited states, logarithmic. Arrows: the policy as a vector field,
     (π(s) − u_s)/(u_u − u_l), right where the first input rises and up where the second does; an
     arrow's length goes with the root of its size. Red: bounds. Cross: operating point.
+
+    Args:
+        runs: trajectory of each controller.
+        policies: action (m,) of each controller in a state (n,).
+        scenario: of the plant, with two states and two inputs.
     """
     visited = np.concatenate([run.states for run in runs.values()])
     low, high = np.quantile(visited, (0.001, 0.999), axis=0)
-    x, y = (np.linspace(low[i], high[i], GRID) for i in range(2))
-    width = (scenario.action_upper - scenario.action_lower)[:2]
-    fields = {
-        case: np.array([[policy(np.array([xj, yi]))[:2] for xj in x] for yi in y])
-        for case, policy in policies.items()
-    }
-    fields = {c: (field - scenario.reference_action[:2]) / width for c, field in fields.items()}
-    longest = max(float(np.nanmax(np.hypot(f[..., 0], f[..., 1]))) for f in fields.values())
+    x = np.linspace(low[0], high[0], GRID)
+    y = np.linspace(low[1], high[1], GRID)
+    fields = {case: _field(policy, x, y, scenario) for case, policy in policies.items()}
+    longest = max(
+        float(np.nanmax(np.hypot(field[..., 0], field[..., 1]))) for field in fields.values()
+    )
     columns = 2 if len(runs) == 4 else min(len(runs), 3)
     rows = -(-len(runs) // columns)
-    half = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
-    extent = (x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1])
+    half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
+    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
     signals = next(iter(runs.values())).signals
     with style.figure(7.0 / columns * rows + 0.4, style.WIDTH if columns > 1 else 4.2) as drawn:
         grid = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(runs) :]:
             axes.set_visible(False)
         for axes, (case, run) in zip(grid.flat, runs.items(), strict=False):
-            _states(axes, run.states[:, :2], extent)
-            _arrows(axes, x, y, fields[case] / (longest or 1.0))
+            _draw_density(axes, run.states[:, :2], extent)
+            _draw_arrows(axes, x, y, fields[case] / (longest or 1.0))
             axes.plot(*scenario.reference_state[:2], "+", color=BOUND, ms=9, mew=1.6, zorder=5)
             for line, i in ((axes.axvline, 0), (axes.axhline, 1)):
                 for bound in (scenario.state_lower[i], scenario.state_upper[i]):
@@ -350,17 +483,47 @@ def phase_figure(
     return drawn
 
 
-def _arrows(axes: Axes, x: Array, y: Array, field: Array) -> None:
+def _field(policy: Policy, x: Array, y: Array, scenario: Scenario) -> Array:
+    """First two inputs of a policy less the operating point, in shares of their range.
+
+    Args:
+        policy: of the state, (n,).
+        x: first state of the grid, (X,).
+        y: second state of the grid, (Y,).
+        scenario: of the plant, with two states.
+
+    Returns:
+        The field, (Y, X, 2).
+    """
+    width = (scenario.action_upper - scenario.action_lower)[:2]
+    actions = np.empty((len(y), len(x), 2))
+    for i, second in enumerate(y):
+        for j, first in enumerate(x):
+            actions[i, j] = policy(np.array([first, second]))[:2]
+    field: Array = (actions - scenario.reference_action[:2]) / width
+    return field
+
+
+def _draw_arrows(axes: Axes, x: Array, y: Array, field: Array) -> None:
+    """Draw a field (Y, X, 2) on a grid as arrows, whose length goes with the root of its size."""
     size = np.hypot(field[..., 0], field[..., 1])
     shrink = 1.0 / np.sqrt(np.where(size > 0, size, 1.0))
     axes.quiver(
-        *np.meshgrid(x, y), field[..., 0] * shrink, field[..., 1] * shrink, angles="uv",
-        pivot="mid", scale=1.05 * max(len(x), len(y)), scale_units="width", width=0.004,
-        color="#1A1A1A", zorder=4,
-    )  # fmt: skip
+        *np.meshgrid(x, y),
+        field[..., 0] * shrink,
+        field[..., 1] * shrink,
+        angles="uv",
+        pivot="mid",
+        scale=1.05 * max(len(x), len(y)),
+        scale_units="width",
+        width=0.004,
+        color="#1A1A1A",
+        zorder=4,
+    )
 
 
-def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]) -> None:
+def _draw_density(axes: Axes, states: Array, extent: tuple[float, float, float, float]) -> None:
+    """Draw how often a run of states (K, 2) was where, within left, right, bottom and top."""
     left, right, bottom, top = extent
     inside = (states > (left, bottom)).all(axis=1) & (states < (right, top)).all(axis=1)
     cells = axes.hexbin(
@@ -373,6 +536,7 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
 
 
 def _policy(run: Run, out: Path) -> Policy:
+    """Action (m,) of a run's controller in a state (n,); raises StudyError where its θ is gone."""
     theta = ""
     if run.training is not None:
         path = out / run.folder / PARAMETERS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import process_time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,7 @@ from scipy.stats import ttest_1samp
 from controllers import compile_functions
 from controllers.factories import nmpc
 from controllers.optimum import QuasiStaticPolicy, fouling, frozen
+from cosim.core.errors import StudyError
 from cosim.core.plugins import build_controller
 from cosim.core.protocols import Array, Controller
 from cosim.core.result import TextTable
@@ -28,12 +29,17 @@ from learning.log import LogRow
 from learning.training_run import TrainingRun, begin
 
 WINDOW = 100
-"""Samples in a row of which the dearest are reported."""
-SHIFT, PARTS, LEVEL = 480, 8, 0.05
-"""Samples in a row that are compared with those of the start, in how many parts, at which level."""
-LIFE = [
+"""Samples in a row of the worst window."""
+SHIFT = 480
+"""Samples in a row, eight hours of a minute each, that are compared with those of the start."""
+SHIFT_PARTS = 8
+"""Parts of a shift, whose means are the values of its test."""
+SHIFT_LEVEL = 0.05
+"""Level of the test, of all shifts of a run together."""
+OPERATION_METRICS = [
     "J", "violating", "dearest", "first_change", "updates", "model_samples", "dearer", "excess",
 ]  # fmt: skip
+"""Columns of operation.csv."""
 
 
 def plant_at(scenario: Scenario, time: float) -> Scenario:
@@ -55,47 +61,77 @@ def optimum_at(scenario: Scenario, sample: int) -> Controller:
     return QuasiStaticPolicy(law, moving.policies, scenario.sampling_time)
 
 
-def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dict[int, float], int]:
-    """Take the samples of a run on its plant; rows of `LIFE` and θ after each of the `marks`.
+@dataclass(frozen=True)
+class OperationRun:
+    """A training from one plant sample to the next, without a reset.
 
-    Also the status, the processor time in s by mark, and the plant samples taken. `metrics` has the
-    rows' costs; `updates` and `model_samples` are numbers so far. The cost of a diverged run is
-    infinite.
+    Attributes:
+        rows: `OPERATION_METRICS` and θ at each mark.
+        status: `finished` or `diverged: …`.
+        processor_seconds: time that the training took up to each mark, in s.
+        plant_samples: samples that were taken of the plant.
     """
-    cost, violating = np.full(run.samples, np.inf), np.ones(run.samples, dtype=bool)
+
+    rows: list[LogRow]
+    status: str
+    processor_seconds: dict[int, float]
+    plant_samples: int
+
+
+def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
+    """Take the samples of a training on its plant, and its metrics after some of them.
+
+    Args:
+        run: the training; its `samples` is the last mark.
+        marks: numbers of samples after which metrics and θ are kept, increasing.
+
+    Returns:
+        The run; the cost of each sample since it has diverged is infinite.
+    """
+    cost = np.full(run.samples, np.inf)
+    violating = np.ones(run.samples, dtype=bool)
     rows: list[LogRow] = []
-    clock: dict[int, float] = {}
-    status, first, updates = "finished", 0, 0
+    processor_seconds: dict[int, float] = {}
+    status = "finished"
+    first_change = 0
+    updates = 0
     with FmuPlant(run.scenario) as plant:
-        held = nmpc(run.scenario, run.starting_parameters(), run.controller)
-        compile_functions(held, run.samples)
-        signals = simulate(plant, held, run.samples, run.seed, residuals=False).signals
-        before = signals["stage_cost"].values + signals["penalty"].values
-        loop, start = begin(run, load_algorithm(run.algorithm), plant), process_time()
+        # What the start's θ costs in the same samples, on the same noise.
+        before = _cost_of_the_start(run, plant)
+        loop = begin(run, load_algorithm(run.algorithm), plant)
+        clock = process_time()
         compile_functions(loop.controller, run.samples)
-        theta, penalty = loop.controller.theta.copy(), run.scenario.state_penalty
+        start_theta = loop.controller.theta.copy()
+        penalty = run.scenario.state_penalty
         for k in range(run.samples):
             if status == "finished":
                 violating[k] = float(penalty.violation(loop.s).sum()) > VIOLATING
                 try:
                     cost[k], update = loop.advance()
                     updates += update is not None
-                    if not first and not np.array_equal(theta, loop.controller.theta):
-                        first = k + 1
+                    if not first_change and not np.array_equal(start_theta, loop.controller.theta):
+                        first_change = k + 1
                 except DivergenceError as error:
                     status = f"diverged: {error} at sample {k + 1}"
             if k + 1 not in marks:
                 continue
-            clock[k + 1] = process_time() - start
-            figures = metrics(k + 1, before, cost, violating, first) | {
-                "updates": float(updates),
-                "model_samples": float(getattr(loop.algorithm, "model_samples", 0)),
-            }
-            rows.append(LogRow(figures, loop.parameters))
-        return rows, status, clock, loop.counts.number
+            processor_seconds[k + 1] = process_time() - clock
+            metrics = operation_metrics(k + 1, before, cost, violating, first_change)
+            metrics["updates"] = float(updates)
+            metrics["model_samples"] = float(getattr(loop.algorithm, "model_samples", 0))
+            rows.append(LogRow(metrics, loop.parameters))
+        return OperationRun(rows, status, processor_seconds, loop.counts.number)
 
 
-def metrics(
+def _cost_of_the_start(run: TrainingRun, plant: FmuPlant) -> Array:
+    """Cost (K,) of each sample of a run if θ stayed as it starts."""
+    controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
+    compile_functions(controller, run.samples)
+    signals = simulate(plant, controller, run.samples, run.seed, residuals=False).signals
+    return signals["stage_cost"].values + signals["penalty"].values
+
+
+def operation_metrics(
     samples: int, before: Array, cost: Array, violating: Array, first_change: int
 ) -> dict[str, float]:
     """What the first samples of a run in operation cost.
@@ -105,102 +141,160 @@ def metrics(
         before: Cost (K,) that the start's θ has in each sample of the run, on the same noise.
         cost: Cost (K,) of each sample.
         violating: Whether each sample violates a bound, (K,).
-        first_change: Number of samples before the first one with another θ; 0 while θ rests.
+        first_change: Number of samples before the first one with another θ; 0 while θ stays.
 
     Returns:
-        `samples`; `J`, the mean cost of all of them; `first_change`, NaN while θ rests; of the
-        samples since then (of all, while θ rests) the share of `violating` ones and `dearest`, the
-        largest mean cost of `WINDOW` samples in a row; `dearer` and `excess` of `dearer_than`, NaN
-        while θ rests. A figure of no sample is NaN.
+        `samples`; `J`, the mean cost of all of them; `first_change`, NaN while θ stays; of the
+        samples since then (of all, while θ stays) the share of `violating` ones and `dearest`, the
+        mean cost of the worst window; `dearer` and `excess`, the number and the excess of
+        `compare_shifts`, NaN while θ stays. A metric of no sample is NaN.
     """
-    changed = first_change > 0
     since = slice(first_change, samples)
-    dearer, excess = dearer_than(before[since], cost[since]) if changed else (np.nan, np.nan)
-    return {
+    metrics = {
         "samples": float(samples),
         "J": float(cost[:samples].mean()),
-        "violating": float(violating[since].mean()) if first_change < samples else np.nan,
-        "dearest": dearest(cost[since]),
-        "first_change": float(first_change) if changed else np.nan,
-        "dearer": dearer,
-        "excess": excess,
+        "violating": np.nan,
+        "dearest": worst_window(cost[since]),
+        "first_change": np.nan,
+        "dearer": np.nan,
+        "excess": np.nan,
     }
+    if first_change < samples:
+        metrics["violating"] = float(violating[since].mean())
+    if first_change > 0:
+        metrics["first_change"] = float(first_change)
+        shifts = compare_shifts(before[since], cost[since])
+        metrics["dearer"] = shifts.higher
+        metrics["excess"] = shifts.largest_excess
+    return metrics
 
 
-def dearest(cost: Array) -> float:
-    """Largest mean of `WINDOW` samples in a row of K, (K,); of all where there are fewer."""
-    if not np.isfinite(cost).all() or not len(cost):
-        return float("inf") if len(cost) else float("nan")
+def worst_window(cost: Array) -> float:
+    """Largest mean cost of `WINDOW` samples in a row.
+
+    Args:
+        cost: of each sample, (K,).
+
+    Returns:
+        The mean; of all samples where there are fewer, infinite after a divergence, NaN of none.
+    """
+    if not len(cost):
+        return float("nan")
+    if not np.isfinite(cost).all():
+        return float("inf")
     width = min(WINDOW, len(cost))
     total = np.concatenate([[0.0], np.cumsum(cost)])
     return float((total[width:] - total[:-width]).max() / width)
 
 
-def dearer_than(before: Array, cost: Array) -> tuple[float, float]:
-    """Number of shifts that are dearer than `before`, and the largest excess of a shift's mean.
+class ShiftComparison(NamedTuple):
+    """Number of shifts whose cost is higher than before, and the largest excess of a mean."""
 
-    Costs (K,) of the same noise, in shifts of `SHIFT` samples; NaN without a shift. A shift is
-    dearer where the excess of its `PARTS` is above zero by a one-sided t test at `LEVEL`
-    (Bonferroni over the shifts).
+    higher: float
+    largest_excess: float
+
+
+def compare_shifts(before: Array, cost: Array) -> ShiftComparison:
+    """Compare costs of the same noise, shift by shift of `SHIFT` samples.
+
+    A shift's cost is higher where the excess of its `SHIFT_PARTS` is above zero by a one-sided
+    t test at `SHIFT_LEVEL` (Bonferroni over the shifts). Samples behind the last whole shift do
+    not count.
+
+    Args:
+        before: cost of each sample that is compared with, (K,).
+        cost: cost of each sample, (K,); infinite after a divergence.
+
+    Returns:
+        The comparison; NaN where there is no whole shift.
     """
-    shifts = len(cost) // SHIFT
-    if not shifts:
-        return np.nan, np.nan
+    n_shifts = len(cost) // SHIFT
+    if not n_shifts:
+        return ShiftComparison(np.nan, np.nan)
+    # Of infinite costs a test has no value: they count by their mean.
     with np.errstate(invalid="ignore", divide="ignore"):
-        parts = (cost - before)[: shifts * SHIFT].reshape(shifts, PARTS, -1).mean(axis=2)
+        excess = (cost - before)[: n_shifts * SHIFT]
+        parts = excess.reshape(n_shifts, SHIFT_PARTS, -1).mean(axis=2)
         p = ttest_1samp(parts, 0.0, axis=1, alternative="greater").pvalue
     mean = parts.mean(axis=1)
-    return float(((p < LEVEL / shifts) | (mean == np.inf)).sum()), float(mean.max())
+    higher = (p < SHIFT_LEVEL / n_shifts) | (mean == np.inf)
+    return ShiftComparison(float(higher.sum()), float(mean.max()))
 
 
 def theta_at(log: str, mark: int) -> tuple[float, ...]:
-    """θ that a run would have handed over after `mark` samples, from the text of its log."""
-    rows = csv.DictReader(log.splitlines())
-    row = next(row for row in rows if int(row["samples"]) == mark)
-    return tuple(float(value) for name, value in row.items() if name.startswith("theta "))
+    """The final θ of a run, had it ended earlier.
+
+    Args:
+        log: text of its learning.csv.
+        mark: number of samples, one that the log has a row of.
+
+    Returns:
+        θ, (n_θ,).
+    """
+    for row in csv.DictReader(log.splitlines()):
+        if int(row["samples"]) == mark:
+            return tuple(float(row[name]) for name in row if name.startswith("theta "))
+    raise StudyError(f"a log of a run in operation has no row of {mark} samples")
 
 
-class Judged(NamedTuple):
-    """Operation on one scenario: by case and samples the greedy costs, and each run's life.
+@dataclass(frozen=True)
+class OperationResult:
+    """Regrets of all runs in operation on one scenario.
 
-    `greedy[case][samples]` has a row for each training seed and a column for each seed of the
-    noise, `optimum[samples]` (S,); `lives` has a row for each run and
-    mark with `regret` (greedy), `life_regret`, `dearest` as a regret, and `excess` as a share of
-    the optimum's cost.
+    Attributes:
+        greedy: J of the greedy policy by case and mark, a row for each training seed and a column
+            for each seed of the noise, (R, S).
+        optimum: J* (S,) on the same noise by mark.
+        runs: a row for each run and mark: `OPERATION_METRICS` with `dearest` as a regret and
+            `excess` as a share of J*; `regret` of the greedy policy; `life_regret` of the whole
+            run.
     """
 
     greedy: dict[str, dict[int, pd.DataFrame]]
     optimum: dict[int, Array]
-    lives: pd.DataFrame
+    runs: pd.DataFrame
 
 
-def judged(lives: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> Judged:
-    """Regrets of the rows of a scenario; without an optimum against the best case at the time."""
+def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> OperationResult:
+    """Regrets of the runs on one scenario; without an optimum, against the best case at the time.
+
+    Args:
+        runs: rows of operation.csv.
+        greedy: rows of greedy.csv.
+        optimum: name of the case whose J is J*; another name if there is none.
+    """
+    costs = _greedy_costs(greedy)
+    best = {mark: table.to_numpy()[0] for mark, table in costs.pop(optimum, {}).items()}
+    same_noise = ["training_seed", "samples"]
+    best_run = runs[runs.case == optimum].set_index(same_noise).J
+    if not best:
+        for mark in runs.samples.unique().tolist():
+            means = [by[mark].to_numpy().mean(axis=0) for by in costs.values() if mark in by]
+            best[mark] = min(means, key=np.mean)
+        best_run = runs.groupby(same_noise).J.min()
+    run_key = ["case", *same_noise]
+    greedy_J = greedy.groupby(run_key).J.mean().rename("greedy_J").reset_index()
+    rows = runs[runs.case != optimum]
+    rows = rows.merge(best_run.rename("optimal_J"), on=same_noise, how="left")
+    rows = rows.merge(greedy_J, on=run_key, how="left")
+    best_mean = rows.samples.map({mark: float(cost.mean()) for mark, cost in best.items()})
+    rows["regret"] = regrets(rows.greedy_J.to_numpy(), best_mean.to_numpy())
+    optimal_J = rows.optimal_J.to_numpy()
+    rows["life_regret"] = regrets(rows.J.to_numpy(), optimal_J)
+    rows["dearest"] = regrets(rows.dearest.to_numpy(), optimal_J)
+    rows["excess"] = relative(rows.excess.to_numpy(), optimal_J)
+    return OperationResult(costs, best, rows)
+
+
+def _greedy_costs(greedy: pd.DataFrame) -> dict[str, dict[int, pd.DataFrame]]:
+    """J by case and mark, (R, S): see `OperationResult.greedy`."""
     costs: dict[str, dict[int, pd.DataFrame]] = {}
     for (case, samples), rows in greedy.groupby(["case", "samples"], sort=False):
-        table = rows.assign(run=rows.training_seed.fillna(-1)).pivot(
-            index="run", columns="seed", values="J"
-        )
+        # A controller has no training seed, and one row.
+        numbered = rows.assign(run=rows.training_seed.fillna(-1))
+        table = numbered.pivot(index="run", columns="seed", values="J")
         costs.setdefault(case, {})[int(samples)] = table
-    best = {samples: cost.to_numpy()[0] for samples, cost in costs.pop(optimum, {}).items()}
-    where = ["training_seed", "samples"]
-    key = ["case", *where]
-    own = lives[lives.case == optimum].set_index(where).J
-    if not best:
-        for mark in lives.samples.unique().tolist():
-            each = (cost[mark].to_numpy().mean(axis=0) for cost in costs.values() if mark in cost)
-            best[mark] = min(each, key=np.mean)
-        own = lives.groupby(where).J.min()
-    found = lives[lives.case != optimum].merge(own.rename("optimal_J"), on=where, how="left")
-    mean = greedy.groupby(key).J.mean().rename("greedy_J").reset_index()
-    found = found.merge(mean, on=key, how="left")
-    level = found.samples.map({samples: float(cost.mean()) for samples, cost in best.items()})
-    found["regret"] = regrets(found.greedy_J.to_numpy(), level.to_numpy())
-    optimal = found.optimal_J.to_numpy()
-    found["life_regret"] = regrets(found.J.to_numpy(), optimal)
-    found["dearest"] = regrets(found.dearest.to_numpy(), optimal)
-    found["excess"] = relative(found.excess.to_numpy(), optimal)
-    return Judged(costs, best, found)
+    return costs
 
 
 def duration(seconds: float) -> str:
@@ -209,75 +303,131 @@ def duration(seconds: float) -> str:
     return f"{day:.3g} d" if day >= 1.0 else f"{seconds / 3600.0:.3g} h"
 
 
-def tables(
-    found: Judged,
+@dataclass(frozen=True)
+class OperationLayout:
+    """What the tables and the figure of a scenario in operation show.
+
+    Attributes:
+        sampling_time: of the plant, in s.
+        columns: marks that tables show.
+        drawn: cases that the figure shows; empty: all.
+    """
+
+    sampling_time: float
+    columns: Sequence[int]
+    drawn: Sequence[str] = ()
+
+    @property
+    def times(self) -> list[str]:
+        """The columns as times of operation."""
+        return [duration(mark * self.sampling_time) for mark in self.columns]
+
+
+def operation_tables(
+    result: OperationResult,
     scenario: str,
-    about: Mapping[str, Any],
+    layout: OperationLayout,
     against: Mapping[str, str | None],
     seconds: Mapping[str, float],
 ) -> Iterator[TextTable]:
     """Title, header and rows of a scenario's tables.
 
-    `about` holds its `sampling_time` and the samples of the `columns`; `against` the counterpart
-    of each case; `seconds` the processor time by case at the last of the samples.
+    Args:
+        result: the regrets of all runs.
+        scenario: its name.
+        layout: what the tables show.
+        against: the counterpart of each case, None where it has none.
+        seconds: processor time in s of a case, up to the last column.
     """
-    marks, lives = about["columns"], found.lives
-    times = [duration(mark * about["sampling_time"]) for mark in marks]
-    for name, title in (
-        ("regret", "Greedy regret in % of the θ that a run would hand over, median (worst)"),
-        ("life_regret", "Regret in % of the run so far, exploration included, median (worst)"),
-    ):
-        grid = lives.pivot_table(
-            index="case", columns="samples", values=name, aggfunc=["median", "max"], sort=False
-        )
-        rows = [
-            [case, *(f"{_percent(row['median'][m])} ({_percent(row['max'][m])})" for m in marks)]
-            for case, row in grid.iterrows()
-        ]
-        yield f"{title}: `{scenario}`", ("case", *times), rows
-    end = lives[lives.samples == marks[-1]]
-    last = end.groupby("case", sort=False)
+    titles = {
+        "regret": "Greedy regret in % of the θ that a run would hand over, median (worst)",
+        "life_regret": "Regret in % of the run so far, exploration included, median (worst)",
+    }
+    for name, title in titles.items():
+        rows = _regret_rows(result.runs, name, layout.columns)
+        yield f"{title}: `{scenario}`", ("case", *layout.times), rows
+    end = result.runs[result.runs.samples == layout.columns[-1]]
     header = (
         "case", "runs", "first change, samples", "violating % since", "dearest 100 samples %",
         "updates", "model samples", "processor s",
     )  # fmt: skip
-    middle = last.median(numeric_only=True)
-    rows = [
-        [
-            case, str(last.size()[case]), _whole(row.first_change),
-            f"{100 * row.violating:.2f}", f"{100 * row.dearest:.1f}",
-            _whole(row.updates), _whole(row.model_samples),
-            _whole(seconds.get(str(case), np.nan)),
-        ]
-        for case, row in middle.iterrows()
-    ]  # fmt: skip
-    yield f"What {times[-1]} of operation took on `{scenario}`, medians", header, rows
-    rows = [
-        [str(case), str(len(own)), f"{_whole(own.dearer.median())} ({_whole(own.dearer.max())})",
-         f"{100 * own.excess.median():.2f} ({100 * own.excess.max():.2f})"]
-        for case, own in end[end.dearer.notna()].groupby("case", sort=False)
-    ]  # fmt: skip
-    if rows:
+    title = f"What {layout.times[-1]} of operation took on `{scenario}`, medians"
+    yield title, header, _effort_rows(end, seconds)
+    if rows := _shift_rows(end):
         title = (
             f"Shifts of {SHIFT} samples dearer than θ as it starts, median (worst): `{scenario}`"
         )
         yield title, ("case", "runs", "shifts", "largest excess %"), rows
+    if rows := _difference_rows(result, layout.columns, against):
+        title = f"Greedy regret less the counterpart's, percentage points [95 %]: `{scenario}`"
+        yield title, ("case", *layout.times), rows
+
+
+def _regret_rows(runs: pd.DataFrame, name: str, marks: Sequence[int]) -> list[list[str]]:
+    """Median and worst regret of each case at each mark."""
+    grid = runs.pivot_table(
+        index="case", columns="samples", values=name, aggfunc=["median", "max"], sort=False
+    )
+    rows = []
+    for case, row in grid.iterrows():
+        cells = [f"{_percent(row['median'][m])} ({_percent(row['max'][m])})" for m in marks]
+        rows.append([str(case), *cells])
+    return rows
+
+
+def _effort_rows(end: pd.DataFrame, seconds: Mapping[str, float]) -> list[list[str]]:
+    """What each case's median run took, of the rows at the last mark."""
+    by_case = end.groupby("case", sort=False)
+    counts = by_case.size()
+    rows = []
+    for case, row in by_case.median(numeric_only=True).iterrows():
+        cells = [
+            str(case),
+            str(counts[case]),
+            _whole(row.first_change),
+            f"{100 * row.violating:.2f}",
+            f"{100 * row.dearest:.1f}",
+            _whole(row.updates),
+            _whole(row.model_samples),
+            _whole(seconds.get(str(case), np.nan)),
+        ]
+        rows.append(cells)
+    return rows
+
+
+def _shift_rows(end: pd.DataFrame) -> list[list[str]]:
+    """Shifts with a higher cost, of the cases that have moved θ for at least one."""
+    rows = []
+    for case, runs in end[end.dearer.notna()].groupby("case", sort=False):
+        higher = f"{_whole(runs.dearer.median())} ({_whole(runs.dearer.max())})"
+        excess = f"{100 * runs.excess.median():.2f} ({100 * runs.excess.max():.2f})"
+        rows.append([str(case), str(len(runs)), higher, excess])
+    return rows
+
+
+def _difference_rows(
+    result: OperationResult, marks: Sequence[int], against: Mapping[str, str | None]
+) -> list[list[str]]:
+    """Regret of a case less that of its counterpart, at each mark."""
     rows = []
     for case, other in against.items():
-        pairs = [found.greedy.get(str(name), {}) for name in (case, other)]
-        if other and all(pairs) and found.optimum:
-            line = [f"{case} − {other}"]
-            for mark in marks:
-                one, two = (costs[mark] for costs in pairs)
-                if len(common := one.index.intersection(two.index)):
-                    one, two = one.loc[common], two.loc[common]
-                one, two = np.broadcast_arrays(one, two)  # a controller has one row, for any seed
-                value, ends, p = paired_difference(one, two, found.optimum[mark])
-                line.append(shown(value, ends, 100, 3) + ("" if np.isnan(p) else f", p {p:.2f}"))
-            rows.append(line)
-    if rows:
-        title = f"Greedy regret less the counterpart's, percentage points [95 %]: `{scenario}`"
-        yield title, ("case", *times), rows
+        costs = result.greedy.get(case, {})
+        other_costs = result.greedy.get(str(other), {})
+        if other is None or not costs or not other_costs or not result.optimum:
+            continue
+        cells = [f"{case} − {other}"]
+        for mark in marks:
+            one, two = costs[mark], other_costs[mark]
+            # Of two trainings the seeds that both have; a controller has one row, for any seed.
+            common = one.index.intersection(two.index)
+            if len(common):
+                one, two = one.loc[common], two.loc[common]
+            pair = np.broadcast_arrays(one, two)
+            value, interval, p = paired_difference(pair[0], pair[1], result.optimum[mark])
+            said = shown(value, interval, 100, 3)
+            cells.append(said if np.isnan(p) else f"{said}, p {p:.2f}")
+        rows.append(cells)
+    return rows
 
 
 def _percent(share: float) -> str:

@@ -27,14 +27,14 @@ from cosim.studies.run import (
     LOG,
     PARAMETERS,
     Run,
-    Training,
+    TrainingJob,
+    folder_name,
     functions_for,
-    safe,
 )
 from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training_run import HELD_OUT, make_run
+from learning.training_run import HELD_OUT
 
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"
@@ -48,6 +48,8 @@ TRAINING_OPTIONS = (
     "divergence", "rest_after",
 )  # fmt: skip
 """What a case's table `training` may say."""
+GRID_FIELDS = ("samples", "start", "nmpc")
+"""Fields of a case, beside its settings, that may be a grid."""
 T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
 
@@ -119,69 +121,93 @@ class Study:
     @cached_property
     def scenarios(self) -> dict[str, Scenario]:
         """Scenarios by name, in the study's order."""
-        own = {}
+        written_here = {}
         for document in self.table.scenario:
             where = f"study '{self.name}', [[scenario]]"
             scenario = Scenario.from_dict(resolved(document, where, self.folder), where)
-            own[scenario.name] = scenario
-        found: dict[str, Scenario] = {}
+            written_here[scenario.name] = scenario
+        scenarios: dict[str, Scenario] = {}
         for source in self.table.scenarios:
             path = self.folder / source if source.endswith(".toml") else source
-            scenario = own.get(source) or Scenario.load(path)
-            if scenario.name in found:
+            scenario = written_here.get(source) or Scenario.load(path)
+            if scenario.name in scenarios:
                 raise StudyError(
                     f"two scenarios are called '{scenario.name}'; their files' name must differ"
                 )
-            found[scenario.name] = scenario
-        return found
+            scenarios[scenario.name] = scenario
+        return scenarios
 
     @cached_property
     def cases(self) -> list[Case]:
         """Every case, grids written out."""
-        cases = [case for table in self.table.case for case in self._expanded(table)]
+        cases: list[Case] = []
+        for table in self.table.case:
+            cases += self._controllers(table) if table.algorithm is None else self._grid(table)
         names = [case.name for case in cases]
-        if twice := [name for name in names if names.count(name) > 1]:
-            raise StudyError(f"two cases are called '{twice[0]}'; give each another name")
-        met = [seed for case in cases for seed in case.training_seeds]
+        for name in names:
+            if names.count(name) > 1:
+                raise StudyError(f"two cases are called '{name}'; give each another name")
+        training_seeds: set[int] = set()
+        for case in cases:
+            training_seeds.update(case.training_seeds)
         for scenario in self.scenarios:
-            held_out, own = self.held_out(scenario).seeds, self.noise(scenario).seeds
-            for seeds, what in ((met, "a training seed"), (held_out, "a seed of the curves")):
-                if common := sorted(set(seeds) & set(own)):
-                    raise StudyError(
-                        f"evaluation: noise seed {common[0]} is {what} too; choose another "
-                        "first_seed"
-                    )
+            evaluation_seeds = set(self.noise(scenario).seeds)
+            self._check_unmet(evaluation_seeds & training_seeds, "a training seed")
+            held_out = set(self.held_out(scenario).seeds)
+            self._check_unmet(evaluation_seeds & held_out, "a seed of the curves")
         return cases
 
-    def _expanded(self, table: CaseTable) -> Iterator[Case]:
-        """The points of a case's grid."""
+    def _check_unmet(self, common: set[int], kind: str) -> None:
+        """Refuse noise that is evaluated on and met elsewhere, too; raises StudyError."""
+        if common:
+            raise StudyError(
+                f"evaluation: noise seed {min(common)} is {kind} too; choose another first_seed"
+            )
+
+    def _scenarios_of(self, table: CaseTable) -> tuple[str, ...]:
         scenarios = tuple(self.scenarios if table.scenarios is None else table.scenarios)
         _check_known(scenarios, self.scenarios, f"case '{table.name}'", "scenario")
-        if table.algorithm is None:
-            given = table.controller or ""
-            for source in (sources := given if isinstance(given, list) else [given]):
-                own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
-                name = f"{table.name}({own})" if table.name and sources[1:] else table.name or own
-                group = table.group or BASELINES
-                yield Case(name, scenarios, group, controller=source, against=table.against)
-            return
-        grid = {"samples": table.samples, "start": table.start, "nmpc": table.nmpc}
-        axes: dict[str, list[Any]]
-        axes = {k: v if isinstance(v, list) else [v] for k, v in grid.items()}
-        axes |= {k: _axis(table.algorithm, k, v) for k, v in table.settings.items()}
-        if empty := [key for key, values in axes.items() if not values]:
-            raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
-        varied = [key for key, values in axes.items() if len(values) > 1]
+        return scenarios
+
+    def _controllers(self, table: CaseTable) -> Iterator[Case]:
+        """The cases of a table with one controller or several."""
+        scenarios = self._scenarios_of(table)
+        sources = table.controller or ""
+        if not isinstance(sources, list):
+            sources = [sources]
+        for source in sources:
+            name = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
+            if table.name:
+                name = f"{table.name}({name})" if len(sources) > 1 else table.name
+            group = table.group or BASELINES
+            yield Case(name, scenarios, group, controller=source, against=table.against)
+
+    def _grid(self, table: CaseTable) -> Iterator[Case]:
+        """The points of the grid of a table with an algorithm."""
+        assert table.algorithm is not None
+        scenarios = self._scenarios_of(table)
+        axes: dict[str, list[Any]] = {}
+        for name in GRID_FIELDS:
+            value = getattr(table, name)
+            axes[name] = value if isinstance(value, list) else [value]
+        for name, value in table.settings.items():
+            axes[name] = _axis(table.algorithm, name, value)
+        for name, values in axes.items():
+            if not values:
+                raise StudyError(f"case '{table.name}': the grid of {name} is empty")
+        varied = [name for name, values in axes.items() if len(values) > 1]
         seeds = table.training_seeds or self.table.training_seeds
-        for values in product(*axes.values()):
-            point = dict(zip(axes, values, strict=True))
-            label = " ".join(f"{key}={_text(point[key])}" for key in varied)
+        for coordinates in product(*axes.values()):
+            point = dict(zip(axes, coordinates, strict=True))
+            label = " ".join(f"{name}={_text(point[name])}" for name in varied)
             yield Case(
                 name=f"{table.name}({label})" if label else str(table.name),
                 scenarios=scenarios,
                 group=table.group or table.algorithm.rpartition(":")[2],
                 algorithm=table.algorithm,
-                **{axis: point.pop(axis) for axis in grid},
+                samples=point.pop("samples"),
+                start=point.pop("start"),
+                nmpc=point.pop("nmpc"),
                 settings=point,
                 training=dict(table.training),
                 training_seeds=tuple(range(seeds.first, seeds.first + seeds.count)),
@@ -282,40 +308,69 @@ class Study:
             raise StudyError(f"{field}: has no number for '{scenario}', and no '{DEFAULT}'")
         return number
 
-    def training(self, case: Case, scenario: str, seed: int) -> dict[str, Any]:
-        """The `training` of a case's run on a scenario; raises ConfigurationError."""
+    def training(self, case: Case, scenario: str, seed: int, theta: str | None) -> TrainingJob:
+        """The training of a case's run.
+
+        Args:
+            case: one with an algorithm.
+            scenario: name of the scenario.
+            seed: training seed.
+            theta: text of the θ file where θ starts; None for a start with a name.
+
+        Raises:
+            ConfigurationError: the algorithm has no place in the study, or an option is none.
+        """
         assert case.algorithm is not None
-        curves, samples = self.held_out(scenario), case.samples
-        if marks := self.marks(scenario):
+        marks = self.marks(scenario)
+        samples = case.samples
+        if marks:
             samples = marks[-1]
-            if (asked := load_algorithm(case.algorithm).requires) != "operation":
+            requires = load_algorithm(case.algorithm).requires
+            if requires != "operation":
                 raise ConfigurationError(
-                    f"case '{case.name}': '{case.algorithm}' requires a {asked}, and a study in "
+                    f"case '{case.name}': '{case.algorithm}' requires a {requires}, and a study in "
                     "operation has none"
                 )
+        for name in ("controller", "seed", "start"):
+            if name in case.training:
+                raise ConfigurationError(f"training: {name} is given by the study itself")
+        _check_known(case.training, TRAINING_OPTIONS, "training", "option")
+        return TrainingJob(
+            algorithm=case.algorithm,
+            samples=samples,
+            seed=seed,
+            nmpc=case.nmpc,
+            start=self.located(case.start),
+            theta=theta,
+            settings=case.settings,
+            options=self._intervals(samples, scenario) | dict(case.training),
+            marks=marks,
+        )
+
+    def _intervals(self, samples: int, scenario: str) -> dict[str, int | float | None]:
+        """Options of a training that has the study's number of greedy evaluations."""
+        curves = self.held_out(scenario)
         between = max(1, samples // self.table.curves.points)
         rows = -(-between // ROW)
         log_every = max(1, between // rows)
-        own = {"seed": seed, "controller": case.nmpc, "start": self.located(case.start)}
-        if twice := sorted(own.keys() & case.training):
-            raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
-        _check_known(case.training, TRAINING_OPTIONS, "training", "option")
-        options = {
-            **own,
+        return {
             "log_every": log_every,
             "evaluate_every": rows * log_every,
             "checkpoint_every": log_every * max(1, round(CHECKPOINT / log_every)),
             "evaluation_seeds": len(curves.seeds),
             "evaluation_steps": curves.steps,
-            **case.training,
         }
-        found = {"algorithm": case.algorithm, "samples": samples}
-        return found | {"settings": dict(case.settings), "options": options}
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The runs of a study: controllers first, then seed by seed."""
+class StudyPlan:
+    """The runs of a study: controllers first, then seed by seed.
+
+    Attributes:
+        definition: the study.
+        runs: all of them.
+        provenance: versions, hashes of our code, and of the scenarios and FMUs.
+    """
 
     definition: Study
     runs: list[Run]
@@ -327,32 +382,44 @@ class Plan:
         return sum(run.samples for run in self.runs)
 
 
-def plan(study: Study) -> Plan:
+def plan(study: Study) -> StudyPlan:
     """The runs of a study; every mistake in it is raised here, before the work."""
     plants = {}
-    for name, described in study.scenarios.items():
-        with FmuPlant(described) as plant:
-            plants[name] = {"scenario": described.hash, "fmu": plant.fmu_sha256}
+    for name, scenario in study.scenarios.items():
+        with FmuPlant(scenario) as plant:
+            plants[name] = {"scenario": scenario.hash, "fmu": plant.fmu_sha256}
+    # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
+    training_seeds: set[int] = set()
+    for case in study.cases:
+        training_seeds.update(case.training_seeds)
     content: dict[tuple[str, str], _Content] = {}
     runs = []
-    # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
-    met = sorted({seed for case in study.cases for seed in case.training_seeds})
-    for seed, name, case in product((None, *met), study.scenarios, study.all_cases):
+    for seed, name, case in product(
+        (None, *sorted(training_seeds)), study.scenarios, study.all_cases
+    ):
         if seed not in (case.training_seeds or (None,)) or name not in case.scenarios:
             continue
         if (case.name, name) not in content:
             content[case.name, name] = _read(study, case, name)
         runs.append(_run(study, case, name, seed, content[case.name, name]))
     _check_names(study)
-    about = {"versions": versions(), "code_hash": code_hash()}
-    return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
+    provenance = {
+        "versions": versions(),
+        "code_hash": code_hash(),
+        "scenarios": plants,
+        "study": study.name,
+    }
+    return StudyPlan(study, runs, provenance)
 
 
 @dataclass(frozen=True)
 class _Content:
     """What the runs of a case on a scenario have in common, as it was read.
 
-    `theta` is the text of its θ file: of the controller, or of the start of a training.
+    Attributes:
+        conditions: the scenario, and what workers must find.
+        controller: the controller, or the start of a training.
+        theta: text of its θ file; None where it is no file.
     """
 
     conditions: Conditions
@@ -365,9 +432,7 @@ def _read(study: Study, case: Case, name: str) -> _Content:
     scenario = study.scenarios[name]
     controller = ControllerSource.read(study.located(case.controller or case.start))
     if case.algorithm is not None:
-        arguments = study.training(case, name, 0)
-        options = arguments.pop("options")
-        make_run(scenario=scenario, **arguments, **options)
+        study.training(case, name, 0, controller.theta).make_run(scenario)
     elif ":" in (case.controller or ""):
         controller.build(scenario)
     conditions = Conditions.of_now(scenario, case.target, files=study.depends_on)
@@ -376,20 +441,20 @@ def _read(study: Study, case: Case, name: str) -> _Content:
 
 def _run(study: Study, case: Case, name: str, seed: int | None, content: _Content) -> Run:
     """A case's run on a scenario."""
-    marks = study.marks(name) if seed is not None or case.name == study.optima.get(name) else ()
-    training = None
-    if seed is not None:
-        training = Training(study.training(case, name, seed), content.theta, marks)
+    trained = seed is not None
+    is_optimum = case.name == study.optima.get(name)
+    marks = study.marks(name) if trained or is_optimum else ()
     noise, at_marks = _noise(study, case, name, seed, marks)
     facts: dict[str, Any] = {**content.conditions.facts, "functions": functions_for(noise)}
     if content.theta is not None:
         text = content.theta.encode()
         facts[Path(content.controller.name).name] = hashlib.sha256(text).hexdigest()
-    if training is None:
+    training = None
+    if seed is None:
         facts["controller"] = case.controller
     else:  # as the file says, so that results depend on no folder
-        options = training.arguments["options"] | {"start": case.start}
-        facts["training"] = {**training.arguments, "options": options}
+        training = study.training(case, name, seed, content.theta)
+        facts["training"] = training.facts(case.start)
     return Run(
         conditions=content.conditions,
         case=case.name,
@@ -406,19 +471,32 @@ def _run(study: Study, case: Case, name: str, seed: int | None, content: _Conten
 def _noise(
     study: Study, case: Case, name: str, seed: int | None, marks: Iterable[int]
 ) -> tuple[dict[str, Noise], dict[str, int]]:
-    """Noise of a run's evaluations by file, and the mark of operation of those that have one."""
+    """Noise of a run's evaluations by file, and the mark of operation of those that have one.
+
+    Args:
+        study: the study.
+        case: of the run.
+        name: of its scenario.
+        seed: its training seed; None of a controller.
+        marks: samples of operation after which its policy is evaluated.
+    """
     noise = {EVALUATION: study.noise(name)}
-    others = [other for other in study.cases if name in other.scenarios]
-    if seed is None and any(other.algorithm for other in others):
+    cases = [other for other in study.cases if name in other.scenarios]
+    if seed is None and any(other.algorithm for other in cases):
+        # A level for the learning curves.
         noise[GREEDY] = study.held_out(name)
-    at_mark = study.held_out(name)._replace(burn_in=noise[EVALUATION].burn_in)
     at_marks = {f"greedy-{mark}.csv": mark for mark in marks}
-    noise |= dict.fromkeys(at_marks, at_mark)
+    for file in at_marks:
+        noise[file] = study.held_out(name)._replace(burn_in=noise[EVALUATION].burn_in)
     for table in _trajectories(study, case, name, seed):
         noise[table.file] = Noise((table.seed,), table.steps, whole=True)
-    seeds = tuple(sorted({one for other in others for one in other.training_seeds}))
-    if seed is None and seeds:  # the optimum, on the noise of the training seeds
-        noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
+    training_seeds: set[int] = set()
+    for other in cases:
+        training_seeds.update(other.training_seeds)
+    if seed is None and training_seeds:
+        # The optimum, on the noise of the trainings.
+        for mark in marks:
+            noise[f"online-{mark}.csv"] = Noise(tuple(sorted(training_seeds)), mark)
     return noise, at_marks
 
 
@@ -439,11 +517,10 @@ def _trajectories(
 
 def _kept(study: Study, case: Case, name: str, seed: int | None) -> dict[str, str]:
     """Where the study keeps a copy of a run's files, by file."""
-    where, stem = safe(name), safe(case.name)
-    kept = {
-        table.file: f"{TRAJECTORIES}/{table.name}/{where}/{stem}.csv"
-        for table in _trajectories(study, case, name, seed)
-    }
+    where, stem = folder_name(name), folder_name(case.name)
+    kept = {}
+    for table in _trajectories(study, case, name, seed):
+        kept[table.file] = f"{TRAJECTORIES}/{table.name}/{where}/{stem}.csv"
     if _is_first(case, seed) and case.name in study.table.logs:
         kept[LOG] = f"{LOGS}/{where}-{stem}.csv"
         kept[PARAMETERS] = f"{THETA}/{where}-{stem}.toml"

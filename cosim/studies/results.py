@@ -1,4 +1,4 @@
-"""Measurements of a study: frames of runs, evaluations and curves, and all that is made of them."""
+"""Results of a study: its tables, their summaries, figures and report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from cosim.core.validation import instead
 from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
 from cosim.studies import figures, operation, report
-from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
+from cosim.studies.plan import BASELINES, NAIVE, Study, StudyPlan, plan
 from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
 from cosim.studies.run import (
     GREEDY,
@@ -35,31 +35,38 @@ from cosim.studies.run import (
     LOG,
     Runner,
     RunStore,
+    folder_name,
     read_table,
-    safe,
     to_csv,
     typed,
 )
 
-ABOUT, SCHEMA = "study.json", 1
-CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
-TABLES, OPERATION = (RUNS, EVALUATION, CURVES), "operation.csv"
-FILES = (*TABLES, SUMMARY, AGGREGATE, OPERATION, GREEDY, TIMING, ABOUT, "summary.json")
+ABOUT = "study.json"
+SCHEMA = 1
+"""Schema of study.json."""
+CURVES = "curves.csv"
+RUNS_TABLE = "runs.csv"
+SUMMARY = "summary.csv"
+AGGREGATE = "aggregate.csv"
+OPERATION = "operation.csv"
+TABLES = (RUNS_TABLE, EVALUATION, CURVES)
+"""Tables of every study that are read again."""
+STUDY_FILES = (*TABLES, SUMMARY, AGGREGATE, OPERATION, GREEDY, TIMING, ABOUT, "summary.json")
 """Files beside those of the runs; all in a folder belong to one study."""
 WHERE = ["scenario", "case"]
-KEYS = [*WHERE, "training_seed"]
-STATE = [*KEYS, "status", "samples", "plant_samples"]
+RUN_KEYS = [*WHERE, "training_seed"]
+STATE = [*RUN_KEYS, "status", "samples", "plant_samples"]
 MEASURED = {
-    RUNS: STATE,
-    EVALUATION: [*KEYS, "seed", "steps", *INDICATORS],
-    CURVES: [*KEYS, "samples", "J", "greedy_J", "td_error"],
-    OPERATION: [*KEYS, "samples", *operation.LIFE],
-    GREEDY: [*KEYS, "samples", "seed", "J"],
+    RUNS_TABLE: STATE,
+    EVALUATION: [*RUN_KEYS, "seed", "steps", *INDICATORS],
+    CURVES: [*RUN_KEYS, "samples", "J", "greedy_J", "td_error"],
+    OPERATION: [*RUN_KEYS, "samples", *operation.OPERATION_METRICS],
+    GREEDY: [*RUN_KEYS, "samples", "seed", "J"],
 }
 """Columns of the tables that runs give; `TABLES` are those of every study."""
-SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
+CASE_FIELDS = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
 """What study.json says of a case as it is."""
-LEVELS = 4
+MOST_LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
 MEANS = ["economic_cost", "mean_violation", "violating_share"]
@@ -111,36 +118,35 @@ class StudyResults(Shown):
         return cls(folder, about, *tables.values())
 
     @classmethod
-    def written(
-        cls, planned: Plan, out: Path, stores: Iterable[RunStore], *, draw: bool = True
+    def write(
+        cls, plan: StudyPlan, out: Path, stores: Iterable[RunStore], *, draw: bool = True
     ) -> StudyResults:
         """Write the tables and kept files of a plan's finished runs, study.json last.
 
-        `draw` draws the kept trajectories and logs, too.
+        Args:
+            plan: the study's plan.
+            out: folder of the study.
+            stores: what is there of each run.
+            draw: whether the kept trajectories and logs are drawn.
         """
-        cases = [case.name for case in planned.definition.all_cases]
-        places = {key: i for i, key in enumerate(product(planned.definition.scenarios, cases))}
-        runs = [store for store in stores if store.sealed]  # by training seed
-        runs.sort(key=lambda store: places[store.run.scenario.name, store.run.case])
-        for run in planned.runs:
-            for name, target in run.kept.items():
-                if (source := out / run.folder / name).is_file():
-                    (out / target).parent.mkdir(parents=True, exist_ok=True)
-                    write_atomically(out / target, source.read_bytes())
-        tables, about = _measured(runs), document(planned)
-        about["pictures"] = figures.draw(planned, out) if draw else []
-        found = cls(out, about, *(tables[name] for name in TABLES))
+        _keep_files(plan, out)
+        tables = _measured(_in_the_studys_order(plan, stores))
+        about = document(plan)
+        about["pictures"] = figures.draw_kept(plan, out) if draw else []
+        results = cls(out, about, *(tables[name] for name in TABLES))
         if not about.get("operation"):
             del tables[OPERATION], tables[GREEDY]
-        tables |= {RUNS: found.runs, SUMMARY: found.summary, TIMING: _timing(stores)}
-        if len(found.aggregate):
-            tables[AGGREGATE] = found.aggregate
-        with staged(out, FILES) as stage:
+        tables[RUNS_TABLE] = results.runs
+        tables[SUMMARY] = results.summary
+        tables[TIMING] = _timing(stores)
+        if len(results.aggregate):
+            tables[AGGREGATE] = results.aggregate
+        with staged(out, STUDY_FILES) as stage:
             for name, table in tables.items():
                 (stage / name).write_text(to_csv(table), "utf-8")
             text = json.dumps(about, indent=1, sort_keys=True) + "\n"
             (stage / ABOUT).write_text(text, "utf-8")
-        return found
+        return results
 
     @property
     def name(self) -> str:
@@ -163,26 +169,38 @@ class StudyResults(Shown):
         return [name for name, case in self.cases.items() if case["group"] == BASELINES]
 
     @cached_property
-    def _arrays(self) -> dict[tuple[str, str], dict[str, Array]]:
-        """Indicators (R, S) by scenario and case."""
-        found: dict[tuple[str, str], dict[str, Array]] = {}
-        rows = self.state[KEYS].merge(self.evaluation, on=KEYS, how="left")
-        counts = self.state.groupby(WHERE).size()
-        for where, own in rows.groupby(WHERE, sort=False):
-            if own.seed.isna().any() or len(own) % counts[where]:
+    def _indicators(self) -> dict[tuple[str, str], dict[str, Array]]:
+        """Indicators (R, S) of the runs on the noise seeds, by scenario and case."""
+        indicators: dict[tuple[str, str], dict[str, Array]] = {}
+        rows = self.state[RUN_KEYS].merge(self.evaluation, on=RUN_KEYS, how="left")
+        n_runs = self.state.groupby(WHERE).size()
+        for where, measured in rows.groupby(WHERE, sort=False):
+            # A run without a row has no seed; runs of unlike seeds do not fill a rectangle.
+            if measured.seed.isna().any() or len(measured) % n_runs[where]:
                 raise StudyError(f"the tables in '{self.folder}' are damaged: {where}")
-            values = own[[*INDICATORS]].to_numpy(dtype=np.float64).T
-            arrays = np.ascontiguousarray(values).reshape(len(values), counts[where], -1)
-            found[where] = dict(zip(INDICATORS, arrays, strict=True))
-        return found
+            shape = (n_runs[where], -1)
+            indicators[where] = {
+                name: measured[name].to_numpy(dtype=np.float64).reshape(shape)
+                for name in INDICATORS
+            }
+        return indicators
 
     def indicator(self, case: str, scenario: str, name: str = "J") -> Array:
-        """An indicator of a case's runs over the noise seeds, (R, S); (0, 0) without runs."""
-        own = self._arrays.get((scenario, case))
-        return np.zeros((0, 0)) if own is None else own[name]
+        """An indicator of a case's runs over the noise seeds.
 
-    def of(self, case: str, scenario: str) -> pd.DataFrame:
-        """Rows of `runs` of a case on a scenario, by training seed."""
+        Args:
+            case: name of the case.
+            scenario: name of the scenario.
+            name: the indicator.
+
+        Returns:
+            Its values, (R, S); (0, 0) without runs.
+        """
+        measured = self._indicators.get((scenario, case))
+        return np.zeros((0, 0)) if measured is None else measured[name]
+
+    def runs_of(self, case: str, scenario: str) -> pd.DataFrame:
+        """The case's rows of `runs` on a scenario, by training seed."""
         return self.runs[(self.runs.scenario == scenario) & (self.runs.case == case)]
 
     def reference(self, kind: str, scenario: str) -> Array | None:
@@ -191,14 +209,26 @@ class StudyResults(Shown):
         return cost[0] if len(cost) else None
 
     def regret(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
-        """(J − J*)/|J*| of the mean of `runs` (from 0), paired over noise seeds; NaN without J*."""
+        """Regret (J − J*)/|J*| of the mean of some runs, paired over the noise seeds.
+
+        Args:
+            case: name of the case.
+            scenario: name of the scenario.
+            runs: numbers of the runs, from 0, in the order of the training seeds.
+
+        Returns:
+            The regret and its 95 % interval; NaN without J*.
+        """
         best = self.reference("optimum", scenario)
+        if best is None:
+            return Estimate(np.nan)
         cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
-        return Estimate(np.nan) if best is None else statistics.regret(cost, best)
+        return statistics.regret(cost, best)
 
     def gap_closed(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
-        """(J_naive − J)/(J_naive − J*), likewise."""
-        best, naive = (self.reference(kind, scenario) for kind in ("optimum", "naive"))
+        """Share (J_naive − J)/(J_naive − J*) of the mean of some runs; arguments as of `regret`."""
+        best = self.reference("optimum", scenario)
+        naive = self.reference("naive", scenario)
         if best is None or naive is None:
             return Estimate(np.nan)
         cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
@@ -208,14 +238,18 @@ class StudyResults(Shown):
     def runs(self) -> pd.DataFrame:
         """A row for each run: its state, J, regret with its interval over noise, indicators."""
         rows = []
-        for (scenario, case), state in self.state.groupby(WHERE, sort=False):
-            own = self._arrays[scenario, case]
-            for run, known in enumerate(state.to_dict("records")):
-                row = known | _columns("regret", self.regret(case, scenario, [run]))
-                row |= {name: float(own[name][run].mean()) for name in ("J", *MEANS)}
-                row["J"] = row["J"] if np.isfinite(row["J"]) else np.inf
+        for (scenario, case), states in self.state.groupby(WHERE, sort=False):
+            indicators = self._indicators[scenario, case]
+            for run, row in enumerate(states.to_dict("records")):
+                row.update(_columns("regret", self.regret(case, scenario, [run])))
+                for name in ("J", *MEANS):
+                    row[name] = float(indicators[name][run].mean())
+                # The mean cost of a run that diverged may be NaN.
+                if not np.isfinite(row["J"]):
+                    row["J"] = np.inf
                 row["gap_closed"] = self.gap_closed(case, scenario, [run]).value
-                rows.append(row | {"failures": int(own["failures"][run].sum())})
+                row["failures"] = int(indicators["failures"][run].sum())
+                rows.append(row)
         return pd.DataFrame(rows, columns=RUN_COLUMNS).astype({"training_seed": "Int64"})
 
     @cached_property
@@ -226,42 +260,60 @@ class StudyResults(Shown):
         """
         rows: list[dict[str, Any]] = []
         for scenario in self.scenarios:
-            cases = [case for case in self.cases if len(self.indicator(case, scenario))]
-            known = [self._summary(case, scenario) for case in cases]
-            rows += self._ranked(scenario, sorted(known, key=lambda row: float(row["J_median"])))
+            of_scenario = []
+            for case in self.cases:
+                if len(self.indicator(case, scenario)):
+                    of_scenario.append(self._summary_row(case, scenario))
+            of_scenario.sort(key=lambda row: float(row["J_median"]))
+            self._rank(scenario, of_scenario)
+            rows += of_scenario
         return pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
 
-    def _summary(self, case: str, scenario: str) -> dict[str, Any]:
-        runs, own = self.of(case, scenario), self._arrays[scenario, case]
-        cost, values = runs.J.to_numpy(), self.regrets(case, scenario)
-        order = np.argsort(cost, kind="stable")
-        middle = order[(len(order) - 1) // 2 : len(order) // 2 + 1]
-        median = self.regret(case, scenario, list(middle))
-        spread = over_runs([values[order]]) if len(runs) > 1 else Estimate(values[0])
-        best, other = self.reference("optimum", scenario), self.cases[case].get("against")
-        wide, difference, p = None, Estimate(np.nan), np.nan
-        if best is not None and not self._single(case, scenario):
-            wide = two_way(own["J"], best)
-        if best is not None and other is not None and len(self.indicator(other, scenario)):
-            value, ends, p = paired_difference(*self._pairs(case, other, scenario), best)
-            difference = Estimate(value, ends)
-        return {
+    def _summary_row(self, case: str, scenario: str) -> dict[str, Any]:
+        """A case's row of the summary, but for its rank."""
+        runs = self.runs_of(case, scenario)
+        cost = runs.J.to_numpy()
+        by_cost = np.argsort(cost, kind="stable")
+        regrets = self.regrets(case, scenario)[by_cost]
+        # The middle run, or both middle ones.
+        middle = list(by_cost[(len(cost) - 1) // 2 : len(cost) // 2 + 1])
+        iqm = over_runs([regrets]) if len(runs) > 1 else Estimate(regrets[0])
+        row: dict[str, Any] = {
             "scenario": scenario,
             "case": case,
             "samples": runs.samples.max(),
             "plant_samples": runs.plant_samples.max(),
             "finished": int((~runs.status.str.startswith("diverged")).sum()),
             "runs": len(runs),
-            **_columns("regret_median", median),
-            "regret_worst": float(values[order[-1]]),
-            **_columns("regret_iqm", spread),
+            "regret_worst": float(regrets[-1]),
             "J_median": float(np.median(cost)),
-            "J_worst": float(cost[order[-1]]),
-            "J_iqm": over_runs([cost[order]]).value,
-            "gap_closed_median": self.gap_closed(case, scenario, list(middle)).value,
-            **{name: float(np.median(runs[name])) for name in MEANS},
-            "failures": int(own["failures"].sum()),
-            **_columns("regret_wide", Estimate(np.nan, wide)),
+            "J_worst": float(cost[by_cost[-1]]),
+            "J_iqm": over_runs([cost[by_cost]]).value,
+            "gap_closed_median": self.gap_closed(case, scenario, middle).value,
+            "failures": int(self.indicator(case, scenario, "failures").sum()),
+        }
+        row.update(_columns("regret_median", self.regret(case, scenario, middle)))
+        row.update(_columns("regret_iqm", iqm))
+        for name in MEANS:
+            row[name] = float(np.median(runs[name]))
+        row.update(self._comparisons(case, scenario))
+        return row
+
+    def _comparisons(self, case: str, scenario: str) -> dict[str, Any]:
+        """Columns of the summary that need J*: the wide interval, and the paired difference."""
+        best = self.reference("optimum", scenario)
+        other = self.cases[case].get("against")
+        wide_interval = None
+        difference = Estimate(np.nan)
+        p = np.nan
+        if best is not None and not self._single(case, scenario):
+            wide_interval = two_way(self.indicator(case, scenario), best)
+        if best is not None and other is not None and len(self.indicator(other, scenario)):
+            cost, other_cost = self._pairs(case, other, scenario)
+            value, interval, p = paired_difference(cost, other_cost, best)
+            difference = Estimate(value, interval)
+        return {
+            **_columns("regret_wide", Estimate(np.nan, wide_interval)),
             "against": other,
             **_columns("difference", difference),
             "difference_p": p,
@@ -273,36 +325,39 @@ class StudyResults(Shown):
 
     def _pairs(self, case: str, other: str, scenario: str) -> tuple[Array, Array]:
         """J (R, S) of two cases over the training seeds that both have; a controller has any."""
-        costs = [self.indicator(name, scenario) for name in (case, other)]
-        seeds = [self.of(name, scenario).training_seed for name in (case, other)]
-        if seeds[0].notna().all() and seeds[1].notna().all():
-            common = sorted(set(seeds[0]) & set(seeds[1]))
-            costs = [
-                cost[[list(own).index(seed) for seed in common]]
-                for cost, own in zip(costs, seeds, strict=True)
-            ]
-        one, two = np.broadcast_arrays(*costs)
-        return one, two
+        cost = self.indicator(case, scenario)
+        other_cost = self.indicator(other, scenario)
+        seeds = self.runs_of(case, scenario).training_seed
+        other_seeds = self.runs_of(other, scenario).training_seed
+        if seeds.notna().all() and other_seeds.notna().all():
+            common = sorted(set(seeds) & set(other_seeds))
+            cost = cost[[list(seeds).index(seed) for seed in common]]
+            other_cost = other_cost[[list(other_seeds).index(seed) for seed in common]]
+        pair = np.broadcast_arrays(cost, other_cost)
+        return pair[0], pair[1]
 
-    def _ranked(self, scenario: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Rank the rows; those that do not differ from the first of their group share its rank."""
+    def _rank(self, scenario: str, rows: list[dict[str, Any]]) -> None:
+        """Set the ranks of rows, the lowest median J first.
+
+        Those that do not differ from the first of their group share its rank.
+        """
         first = 0
         for place, row in enumerate(rows):
-            leader = rows[first]["case"]
-            cost, other = self._pairs(row["case"], leader, scenario)
-            below = self.reference("optimum", scenario)
-            below = other.mean(axis=0) if below is None else below
-            alone = any(self._single(case, scenario) for case in (row["case"], leader))
-            unpaired = alone or not len(cost)  # no training seed in common
-            interval = None if unpaired else paired_difference(cost, other, below)[1]
-            if interval is not None and interval[0] > 0:
-                first = place
+            case, leader = row["case"], rows[first]["case"]
+            cost, leader_cost = self._pairs(case, leader, scenario)
+            best = self.reference("optimum", scenario)
+            if best is None:
+                best = leader_cost.mean(axis=0)
+            spread_known = not (self._single(case, scenario) or self._single(leader, scenario))
+            if spread_known and len(cost):  # they have a training seed in common
+                interval = paired_difference(cost, leader_cost, best)[1]
+                if interval is not None and interval[0] > 0:
+                    first = place
             row["rank"] = first + 1
-        return rows
 
     def regrets(self, case: str, scenario: str) -> Array:
         """Regret (R,) of each run; infinite if J is not finite, NaN if J* is unknown."""
-        runs = self.of(case, scenario)
+        runs = self.runs_of(case, scenario)
         if self.reference("optimum", scenario) is None:
             return np.full(len(runs), np.nan)
         return np.where(np.isfinite(runs.J), runs.regret, np.inf)
@@ -313,16 +368,22 @@ class StudyResults(Shown):
 
         The bootstrap is stratified: runs are resampled within their scenario.
         """
+        scenarios = [name for name in self.scenarios if self.reference("optimum", name) is not None]
         rows: list[dict[str, Any]] = []
-        known = [s for s in self.scenarios if self.reference("optimum", s) is not None]
-        for case in self.cases if len(known) > 1 else ():
-            strata = [self.regrets(case, scenario) for scenario in known]
-            if not all(map(len, strata)):
+        for case in self.cases if len(scenarios) > 1 else ():
+            strata = [self.regrets(case, scenario) for scenario in scenarios]
+            if not all(len(regrets) for regrets in strata):
                 continue
-            spread, everything = over_runs(strata), np.concatenate(strata)
-            row = {"case": case, "scenarios": len(strata), "runs": len(everything)}
-            row |= {"regret_median": np.median(everything), "regret_worst": everything.max()}
-            rows.append(row | _columns("regret_iqm", spread))
+            all_regrets = np.concatenate(strata)
+            row = {
+                "case": case,
+                "scenarios": len(strata),
+                "runs": len(all_regrets),
+                "regret_median": np.median(all_regrets),
+                "regret_worst": all_regrets.max(),
+            }
+            row.update(_columns("regret_iqm", over_runs(strata)))
+            rows.append(row)
         rows.sort(key=lambda row: float(row["regret_iqm"]))
         return pd.DataFrame(rows, columns=AGGREGATE_COLUMNS)
 
@@ -333,10 +394,15 @@ class StudyResults(Shown):
     def lines(
         self, scenario: str, columns: Sequence[str] | None = None
     ) -> tuple[Sequence[str], list[list[str]]]:
-        """Header and rows of a scenario's table as texts; `columns` are keys of `COLUMNS`.
+        """Header and rows of a scenario's table as texts.
 
-        By default all, the last three only where a case has a counterpart. Raises StudyError for
-        another column.
+        Args:
+            scenario: its name.
+            columns: keys of `COLUMNS`; by default all, the last three only where a case has a
+                counterpart.
+
+        Raises:
+            StudyError: there is no such column.
         """
         if columns is None:
             paired = any(case.get("against") for case in self.cases.values())
@@ -344,8 +410,8 @@ class StudyResults(Shown):
         for name in columns:
             if name not in COLUMNS:
                 raise StudyError(f"a table has no column '{name}'{instead(name, COLUMNS)}")
-        own = self.summary[self.summary.scenario == scenario].to_dict("records")
-        return report.texts(own, dict(COLUMNS[name] for name in columns))
+        rows = self.summary[self.summary.scenario == scenario].to_dict("records")
+        return report.texts(rows, dict(COLUMNS[name] for name in columns))
 
     def table(self, scenario: str | None = None) -> str:
         """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
@@ -354,23 +420,30 @@ class StudyResults(Shown):
         return "\n".join(f"{name}\n\n{self.table(name)}" for name in self.scenarios)
 
     def _facts(self) -> dict[str, object]:
-        counted = {"scenarios": self.scenarios, "cases": self.cases, "runs": self.state}
-        counts = {name: len(each) for name, each in counted.items()}
-        return {"name": self.name, **counts, "folder": self.folder}
+        return {
+            "name": self.name,
+            "scenarios": len(self.scenarios),
+            "cases": len(self.cases),
+            "runs": len(self.state),
+            "folder": self.folder,
+        }
 
     def _repr_html_(self) -> str:
-        tables = {name: self.lines(name, SHORT) for name in self.scenarios}
-        return "".join(
-            f"<h4>{escape(name)}</h4>" + pd.DataFrame(rows, columns=list(head)).to_html(index=False)
-            for name, (head, rows) in tables.items()
-        )
+        parts = []
+        for name in self.scenarios:
+            header, rows = self.lines(name, SHORT)
+            table = pd.DataFrame(rows, columns=list(header)).to_html(index=False)
+            parts.append(f"<h4>{escape(name)}</h4>{table}")
+        return "".join(parts)
 
-    def further(self) -> Iterator[TextTable]:
+    def further_tables(self) -> Iterator[TextTable]:
         """Title, header and rows of the tables that the study asks for beside its summary."""
         against = {name: case.get("against") for name, case in self.cases.items()}
-        for scenario, about in (self.about.get("operation") or {}).items():
-            judged, seconds = self._judged(scenario), self._seconds(scenario)
-            yield from operation.tables(judged, scenario, about, against, seconds)
+        for scenario in self.about.get("operation") or {}:
+            result = self._operation_result(scenario)
+            seconds = self._processor_seconds(scenario)
+            layout = self._operation_layout(scenario)
+            yield from operation.operation_tables(result, scenario, layout, against, seconds)
         if "paper" in self.about["tables"]:
             yield self.paper()
 
@@ -382,27 +455,12 @@ class StudyResults(Shown):
         rows = []
         trained = [name for name, case in self.cases.items() if case["trained"]]
         for scenario, case in product(self.scenarios, trained):
-            bases = [self._arrays.get((scenario, name)) for name in PAPER]
-            own = self._arrays.get((scenario, case))
-            known = [base for base in bases if base is not None]
-            if own is None or len(known) < len(bases):
+            bases = [self._indicators.get((scenario, name)) for name in PAPER]
+            indicators = self._indicators.get((scenario, case))
+            there = [base for base in bases if base is not None]
+            if indicators is None or len(there) < len(bases):
                 continue
-            cost = own["J"].mean(axis=1)
-            middle = np.argsort(cost, kind="stable")[(len(cost) - 1) // 2]
-            gains = [
-                statistics.gain(own[name][middle], base[name][0])
-                for name in ("J", "economic_cost")
-                for base in known
-            ]
-            agrees = [
-                f"({letter})"
-                for letter, found, wanted in zip("ab", gains[:2], PAPER.values(), strict=True)
-                if abs(100 * found.value - wanted) <= NEAR
-            ]
-            ratio = f"{known[1]['J'].mean() / known[0]['J'].mean():.3f}"
-            texts = (shown(*one, 100.0, 3) for one in gains)
-            best = shown(float(cost[middle]), digits=6)
-            rows.append([scenario, case, ratio, best, *texts, " and ".join(agrees)])
+            rows.append([scenario, case, *_gains_over_baselines(indicators, there)])
         said = "the paper's text states about 21 % over (a) and 15 % over (b)"
         header = (
             "scenario", "case", "J(b)/J(a)", "J, median", "gain over (a) %", "gain over (b) %",
@@ -438,87 +496,119 @@ class StudyResults(Shown):
         Returns:
             Names of the figures by scenario.
         """
-        return {
-            scenario: save_set(
-                (
-                    (f"{kind}-{safe(scenario)}", drawn)
-                    for kind, maker in self._makers.items()
-                    if (drawn := maker(scenario)) is not None
-                ),
-                folder,
-                formats,
-            )
-            for scenario in self.scenarios
-        }
+        names = {}
+        for scenario in self.scenarios:
+            drawn = []
+            for kind, maker in self._makers.items():
+                if (made := maker(scenario)) is not None:
+                    drawn.append((f"{kind}-{folder_name(scenario)}", made))
+            names[scenario] = save_set(drawn, folder, formats)
+        return names
 
     @property
     def _styles(self) -> dict[str, LineStyle]:
         return palette(list(self.cases), self.scenarios)
 
     def _regret(self, scenario: str) -> Figure | None:
+        """Regrets of all runs; None where J* is unknown."""
         if self.reference("optimum", scenario) is None:
             return None
-        rows = []
+        dots = []
         for row in self.summary[self.summary.scenario == scenario].to_dict("records"):
             case = str(row["case"])
-            if case != self.about["optimum"][scenario]:
-                kind = "regret_iqm" if row["runs"] > 1 else "regret_median"
-                middle, low, high = (100 * row[f"{kind}{end}"] for end in ("", "_low", "_high"))
-                lost = self.of(case, scenario).status.str.startswith("diverged").to_numpy()
-                values = 100 * self.regrets(case, scenario)
-                rows.append(DotRow(case, values, ~lost, middle, low, high))
-        return figures.regret_figure(rows, self._styles) if rows else None
+            if case == self.about["optimum"][scenario]:
+                continue
+            kind = "regret_iqm" if row["runs"] > 1 else "regret_median"
+            diverged = self.runs_of(case, scenario).status.str.startswith("diverged").to_numpy()
+            dots.append(
+                DotRow(
+                    case,
+                    values=100 * self.regrets(case, scenario),
+                    finished=~diverged,
+                    middle=100 * row[kind],
+                    low=100 * row[f"{kind}_low"],
+                    high=100 * row[f"{kind}_high"],
+                )
+            )
+        return figures.regret_figure(dots, self._styles) if dots else None
 
     def _curves(self, scenario: str) -> Figure | None:
-        """None if no training was evaluated more than once."""
-        own = self.curves[self.curves.scenario == scenario]
-        levels = own[own.training_seed.isna()].set_index("case").greedy_J
-        trained = own[own.training_seed.notna()]
-        greedy = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J
-        drawn = trained[~trained.case.isin(self.baselines)].groupby("case", sort=False)
-        if not (greedy.size() > 1).any() or not len(drawn):
+        """Learning curves; None if no training was evaluated more than once."""
+        rows = self.curves[self.curves.scenario == scenario]
+        trained = rows[rows.training_seed.notna()]
+        greedy = trained.dropna(subset="greedy_J").groupby(RUN_KEYS).greedy_J
+        learned = trained[~trained.case.isin(self.baselines)].groupby("case", sort=False)
+        if not (greedy.size() > 1).any() or not len(learned):
             return None
-        first, optimum = (self.about[kind].get(scenario) for kind in ("naive", "optimum"))
-        best = float(levels.get(optimum, np.nan))
+        controllers = rows[rows.training_seed.isna()].set_index("case").greedy_J
+        best = float(controllers.get(self.about["optimum"].get(scenario), np.nan))
         known = bool(np.isfinite(best))
-        curves = {
-            str(case): figures.learning_curve(rows, best if known else None) for case, rows in drawn
-        }
-        marks = pd.concat([levels, greedy.last().groupby("case").median()])
-        marks = marks[marks.index.isin(self.baselines) & (marks.index != optimum)]
-        marks = marks[np.isfinite(marks)]
+        curves = {}
+        for case, log in learned:
+            curves[str(case)] = figures.learning_curve(log, best if known else None)
+        levels = self._levels(scenario, controllers, greedy.last().groupby("case").median())
+        if known:
+            levels[:] = 100 * statistics.regrets(levels.to_numpy(), best)
+        return figures.curves_figure(
+            curves,
+            {str(name): float(cost) for name, cost in levels.items()},
+            self._styles,
+            relative=known,
+        )
+
+    def _levels(self, scenario: str, controllers: pd.Series, trained: pd.Series) -> pd.Series:
+        """Greedy costs of the baselines that a figure of curves shows as lines, by name.
+
+        Args:
+            scenario: its name.
+            controllers: greedy cost of each controller, by name.
+            trained: median greedy cost of each trained case at its end, by name.
+        """
+        costs = pd.concat([controllers, trained])
+        optimum = self.about["optimum"].get(scenario)
+        costs = costs[costs.index.isin(self.baselines) & (costs.index != optimum)]
+        costs = costs[np.isfinite(costs)]
         # Naive stays: it is where the curves begin.
-        chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
-        level = 100 * statistics.regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
-        levels = dict(zip(chosen, map(float, level), strict=True))
-        return figures.curves_figure(curves, levels, self._styles, relative=known)
+        first = self.about["naive"].get(scenario)
+        in_order = sorted(costs.index, key=lambda name: (name != first, costs[name]))
+        return costs[in_order[:MOST_LEVELS]]
 
-    def _judged(self, scenario: str) -> operation.Judged:
-        lives = read_table(self.folder / OPERATION, needed=["samples"])
-        lives = lives.reindex(columns=MEASURED[OPERATION])  # an older table lacks the latest ones
+    def _operation_result(self, scenario: str) -> operation.OperationResult:
+        """Regrets of the runs in operation on a scenario."""
+        runs = read_table(self.folder / OPERATION, needed=["samples"])
+        runs = runs.reindex(columns=MEASURED[OPERATION])  # an older table lacks the latest ones
         greedy = read_table(self.folder / GREEDY, MEASURED[GREEDY])
-        own = [table[table.scenario == scenario] for table in (lives, greedy)]
-        return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
+        return operation.operation_result(
+            runs[runs.scenario == scenario],
+            greedy[greedy.scenario == scenario],
+            self.about["optimum"].get(scenario, ""),
+        )
 
-    def _seconds(self, scenario: str) -> dict[str, float]:
+    def _operation_layout(self, scenario: str) -> operation.OperationLayout:
+        about = self.about["operation"][scenario]
+        return operation.OperationLayout(about["sampling_time"], about["columns"], about["drawn"])
+
+    def _processor_seconds(self, scenario: str) -> dict[str, float]:
         """Median processor time in s of a case's runs, up to their last sample."""
         path = self.folder / TIMING
         if not path.is_file():
             return {}
         clock = read_table(path, needed=["run"]).set_index("run").training_seconds
         last = self.about["operation"][scenario]["columns"][-1]
-        own = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
-        names = own.case + " on " + scenario + ", seed " + own.training_seed.astype(str)
+        runs = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
+        names = runs.case + " on " + scenario + ", seed " + runs.training_seed.astype(str)
         seconds = (names + f", sample {last}").map(clock)
-        return dict(seconds.groupby(own.case).median())
+        return dict(seconds.groupby(runs.case).median())
 
     def _operation(self, scenario: str) -> Figure | None:
+        """Regret in operation; None where there is no course to draw."""
         if scenario not in (self.about.get("operation") or {}):
             return None
-        about, judged = self.about["operation"][scenario], self._judged(scenario)
-        if judged.lives.samples.nunique() == 1:  # no course to draw
+        result = self._operation_result(scenario)
+        if result.runs.samples.nunique() == 1:
             return None
-        return figures.operation_figure(judged, about, self._styles, self.baselines)
+        layout = self._operation_layout(scenario)
+        return figures.operation_figure(result, layout, self._styles, self.baselines)
 
     def report(self) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
@@ -540,17 +630,27 @@ class StudyResults(Shown):
         """
         sections: list[dict[str, Any]] = []
         for name in self.scenarios:
-            words = {"title": f"Scenario {name}", "note": self._noise(name)}
-            sections.append(words | {"table": self.lines(name), "figures": drawn[name]})
+            sections.append(
+                {
+                    "title": f"Scenario {name}",
+                    "note": self._noise_note(name),
+                    "table": self.lines(name),
+                    "figures": drawn[name],
+                }
+            )
         if len(self.aggregate):
             table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE)
             sections.append({"title": "All scenarios", "table": table})
-        sections += [{"title": title, "table": table} for title, *table in self.further()]
+        for title, header, rows in self.further_tables():
+            sections.append({"title": title, "table": (header, rows)})
         if self.about["pictures"]:
             sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
         table = report.texts(self.cases.values(), report.CASES)
         sections.append({"title": "Cases", "table": table})
-        made = self.about["made_with"]
+        made_with = self.about["made_with"]
+        made = f"Made with {made_with['versions']}; code {made_with['code_hash']}"
+        if made_with.get("commit"):
+            made += f"; commit {made_with['commit']}"
         return {
             "title": self.about["title"] or self.name,
             "description": self.about["description"],
@@ -559,64 +659,115 @@ class StudyResults(Shown):
             "sections": sections,
             "every": report.texts(self.runs.to_dict("records"), report.EVERY_RUN),
             "command": ["cosim", "study", "run", self.about.get("file") or f"{self.name}.toml"],
-            "made": f"Made with {made['versions']}; code {made['code_hash']}"
-            + (f"; commit {made['commit']}" if made.get("commit") else ""),
+            "made": made,
             "date": report.date(self.folder / TIMING),
         }
 
-    def _noise(self, scenario: str) -> str:
-        """The noise that a scenario's figures were measured on."""
-        own = self.evaluation[self.evaluation.scenario == scenario]
-        if own.empty:
+    def _noise_note(self, scenario: str) -> str:
+        """The noise that a scenario's figures were measured on, in words."""
+        rows = self.evaluation[self.evaluation.scenario == scenario]
+        if rows.empty:
             return "No run is finished."
         seeds, steps = self.about["curves"][scenario]
         return (
-            f"Table and regret: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
+            f"Table and regret: {rows.seed.nunique()} noise seeds × {rows.steps.iloc[0]} "
             f"samples. Learning curves: {seeds} other seeds × {steps} samples. Regrets of a case "
             "differ between the two."
         )
 
 
-def _columns(name: str, found: Estimate) -> dict[str, float]:
-    low, high = found.interval or (np.nan, np.nan)
-    return {name: found.value, f"{name}_low": low, f"{name}_high": high}
+def _columns(name: str, estimate: Estimate) -> dict[str, float]:
+    """An estimate as columns of a table: its value, and the ends of its interval or NaN."""
+    low, high = estimate.interval or (np.nan, np.nan)
+    return {name: estimate.value, f"{name}_low": low, f"{name}_high": high}
+
+
+def _gains_over_baselines(
+    indicators: Mapping[str, Array], bases: Sequence[Mapping[str, Array]]
+) -> list[str]:
+    """Cells of the paper's table: what a case's median run gains over (a) and (b).
+
+    Args:
+        indicators: of the case, (R, S) each.
+        bases: indicators of the controllers (a) and (b), (1, S) each.
+    """
+    cost = indicators["J"].mean(axis=1)
+    middle = np.argsort(cost, kind="stable")[(len(cost) - 1) // 2]
+    gains = []
+    for name in ("J", "economic_cost"):
+        for base in bases:
+            gains.append(statistics.gain(indicators[name][middle], base[name][0]))
+    agrees = []
+    for letter, gain, of_the_paper in zip("ab", gains[:2], PAPER.values(), strict=True):
+        if abs(100 * gain.value - of_the_paper) <= NEAR:
+            agrees.append(f"({letter})")
+    ratio = bases[1]["J"].mean() / bases[0]["J"].mean()
+    texts = [shown(gain.value, gain.interval, 100.0, 3) for gain in gains]
+    median = shown(float(cost[middle]), digits=6)
+    return [f"{ratio:.3f}", median, *texts, " and ".join(agrees)]
+
+
+def _in_the_studys_order(plan: StudyPlan, stores: Iterable[RunStore]) -> list[RunStore]:
+    """The finished runs by scenario, case and training seed."""
+    cases = [case.name for case in plan.definition.all_cases]
+    places = {where: i for i, where in enumerate(product(plan.definition.scenarios, cases))}
+    finished = [store for store in stores if store.complete]  # by training seed
+    return sorted(finished, key=lambda store: places[store.run.scenario.name, store.run.case])
+
+
+def _keep_files(plan: StudyPlan, out: Path) -> None:
+    """Copy the files that the study keeps of its runs to where it keeps them."""
+    for run in plan.runs:
+        for name, target in run.kept.items():
+            source = out / run.folder / name
+            if source.is_file():
+                (out / target).parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(out / target, source.read_bytes())
 
 
 def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
     """The tables `MEASURED` of finished runs.
 
-    In operation the optimum has a life on the noise of every training seed, of which J is known.
+    In operation the optimum has a run on the noise of every training seed, of which J is known.
     """
     parts: dict[str, list[pd.DataFrame]] = {name: [] for name in MEASURED}
     for store in stores:
-        run, about = store.run, store.about
-        key = dict(zip(KEYS, (run.scenario.name, run.case, run.seed), strict=True))
-        counts = {name: int(about.get(name, 0)) for name in ("samples", "plant_samples")}
-        parts[RUNS].append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
+        run = store.run
+        key = {"scenario": run.scenario.name, "case": run.case, "training_seed": run.seed}
+        state = {
+            "status": store.status or "evaluated",
+            "samples": int(store.about.get("samples", 0)),
+            "plant_samples": int(store.about.get("plant_samples", 0)),
+        }
+        parts[RUNS_TABLE].append(pd.DataFrame([key | state]))
         if run.training is not None:
             log = read_table(store.folder / LOG).assign(**key)
             parts[CURVES].append(log)
-            parts[OPERATION] += [log] if run.training.marks else []
+            if run.training.marks:
+                parts[OPERATION].append(log)
         online = []
         for file, noise in run.noise.items():
             if noise.whole:
                 continue
             rows = store.measured(file).rename_axis("seed").reset_index()
-            if (mark := run.marks.get(file)) is not None:
-                parts[GREEDY].append(rows.assign(**key, samples=mark))
+            if file in run.marks:
+                parts[GREEDY].append(rows.assign(**key, samples=run.marks[file]))
             elif file == GREEDY:
                 mean = key | {"greedy_J": float(rows.J.mean())}
                 parts[CURVES].append(pd.DataFrame([mean]))
             elif file == EVALUATION:
                 parts[EVALUATION].append(rows.assign(**key, steps=noise.steps))
             else:
-                life = key | {"training_seed": rows.seed, "samples": noise.steps}
-                online.append(rows[["J"]].assign(**life))
+                # A run of the optimum for each training seed, as long as a mark.
+                of_the_optimum = key | {"training_seed": rows.seed, "samples": noise.steps}
+                online.append(rows[["J"]].assign(**of_the_optimum))
         if online:
             parts[OPERATION].append(pd.concat(online).sort_values(["training_seed", "samples"]))
-    none = [pd.DataFrame()]
-    found = {name: pd.concat(own or none, ignore_index=True) for name, own in parts.items()}
-    return {name: typed(found[name].reindex(columns=columns)) for name, columns in MEASURED.items()}
+    tables = {}
+    for name, columns in MEASURED.items():
+        rows = pd.concat(parts[name] or [pd.DataFrame()], ignore_index=True)
+        tables[name] = typed(rows.reindex(columns=columns))
+    return tables
 
 
 def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
@@ -624,52 +775,57 @@ def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
     rows = []
     for store in stores:
         clock = store.about.get("timing", {})
-        seconds = {str(store.run): clock.get("wall_seconds", 0.0)}
-        marks = clock.get("processor_seconds", {})
-        seconds |= {f"{store.run}, sample {mark}": value for mark, value in marks.items()}
-        rows += [{"run": name, "training_seconds": float(value)} for name, value in seconds.items()]
+        name = str(store.run)
+        rows.append({"run": name, "training_seconds": float(clock.get("wall_seconds", 0.0))})
+        for mark, seconds in clock.get("processor_seconds", {}).items():
+            rows.append({"run": f"{name}, sample {mark}", "training_seconds": float(seconds)})
     return pd.DataFrame(rows, columns=["run", "training_seconds"])
 
 
-def document(plan: Plan) -> dict[str, Any]:
+def document(plan: StudyPlan) -> dict[str, Any]:
     """The document study.json of a plan."""
     definition = plan.definition
     scenarios = list(definition.scenarios)
-    curves = {name: definition.held_out(name) for name in scenarios}
+    cases = []
+    for case in definition.all_cases:
+        about_case = {name: getattr(case, name) for name in CASE_FIELDS}
+        about_case["trained"] = case.algorithm is not None
+        about_case["against"] = definition.counterpart(case)
+        cases.append(about_case)
+    curves = {}
+    for name in scenarios:
+        noise = definition.held_out(name)
+        curves[name] = [len(noise.seeds), noise.steps]
     about = {
         "schema": SCHEMA,
         "name": definition.name,
         "title": definition.table.title,
         "description": definition.table.description,
         "scenarios": scenarios,
-        "cases": [
-            {
-                **{name: getattr(case, name) for name in SAME},
-                "trained": case.algorithm is not None,
-                "against": definition.counterpart(case),
-            }
-            for case in definition.all_cases
-        ],
+        "cases": cases,
         "file": Path(definition.file).name if definition.file else None,
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.named(NAIVE)),
-        "curves": {name: [len(noise.seeds), noise.steps] for name, noise in curves.items()},
+        "curves": curves,
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
         "made_with": dict(plan.provenance) | {"commit": report.commit()},
     }
     trains = any(case.algorithm for case in definition.cases)
-    if (table := definition.table.operation) is not None and trains:
-        about["operation"] = {
-            name: {
+    table = definition.table.operation
+    if table is not None and trains:
+        in_operation = {}
+        for name, scenario in definition.scenarios.items():
+            marks = definition.marks(name)
+            columns = [m for m in definition.samples_of(table.columns, name) if m in marks]
+            in_operation[name] = {
                 "sampling_time": scenario.sampling_time,
-                "marks": (marks := definition.marks(name)),
-                "columns": [m for m in definition.samples_of(table.columns, name) if m in marks]
-                or marks,
+                "marks": marks,
+                "columns": columns or marks,
                 "drawn": table.drawn,
             }
-            for name, scenario in definition.scenarios.items()
-        }
+        about["operation"] = in_operation
+    # As it is when it is read again: tuples are lists.
     return dict(json.loads(json.dumps(about)))
 
 
@@ -680,36 +836,43 @@ def study(
     jobs: int = 1,
     scheduler: str | None = None,
     progress: Progress | bool = False,
-    planned: Plan | None = None,
+    planned: StudyPlan | None = None,
     figures: bool = True,
 ) -> StudyResults:
-    """Do the runs of a study that `out` lacks, and write its tables there.
-
-    Raises StudyError and what scenarios and algorithms raise before any work is done;
-    FailedRunsError after all other runs are done and written.
+    """Do the runs of a study that its folder lacks, and write its tables there.
 
     Args:
         source: a study, its file, or the same document as a mapping.
+        out: the study's folder.
         jobs: worker processes; 1 works in this process. No byte of a table depends on it.
         scheduler: address of a Dask scheduler, used in place of `jobs`.
         progress: a `Progress`, called after every work item, and with a line for each run that
             ends; True draws a bar.
         planned: the study's plan, if it is known.
         figures: whether the study's trajectories and logs are drawn.
+
+    Returns:
+        The results of all finished runs.
+
+    Raises:
+        StudyError: the study is no valid one, and what scenarios and algorithms raise, before any
+            work is done.
+        FailedRunsError: runs failed; all others are done and written.
     """
     if isinstance(source, Mapping):
         source = Study.from_dict(source)
-    definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
+    definition = source if isinstance(source, Study) else Study.load(source)
+    folder = Path(out)
     planned = planned or plan(definition)
-    with holding(folder), reporting(progress, definition.name, planned.samples) as report:
-        runner = Runner(planned.runs, folder, report)
+    with holding(folder), reporting(progress, definition.name, planned.samples) as tell:
+        runner = Runner(planned.runs, folder, tell)
         for line in runner.remarks:
-            report(0, "", line)
+            tell(0, "", line)
         runner.run(jobs, scheduler)
-        stores = runner.stores.values()
-        results = StudyResults.written(planned, folder, stores, draw=figures)
+        results = StudyResults.write(planned, folder, runner.stores.values(), draw=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
-        others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""
+        more = len(runner.failures) - 1
+        others = f" ({more} more failed)" if more else ""
         raise FailedRunsError(f"{name}: {failure.message}{others}; run again to try anew")
     return results

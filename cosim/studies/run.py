@@ -1,4 +1,4 @@
-"""Runs of a study: what one is, its work, its folder, and the giving out of the work.
+"""Execute the runs of a study: jobs, worker functions, run folders, scheduling.
 
     OUT/runs/SCENARIO/CASE/SEED/   run.json  checkpoint.npz | learning.csv parameters.toml
                                    evaluation.csv  greedy.csv  greedy-*.csv  online-*.csv
@@ -15,10 +15,10 @@ import json
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from controllers.functions import COMPILED, INTERPRETED, LONG, switch
 from cosim.core.errors import StudyError
@@ -36,10 +36,16 @@ if TYPE_CHECKING:
 
     from learning.training_run import TrainingRun
 
-RUNS, RUN, CHECKPOINT = "runs", "run.json", "checkpoint.npz"
-TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
-GREEDY, FAILURE = "greedy.csv", "failure.txt"
-WRITTEN = (
+RUNS_FOLDER = "runs"
+RUN_FILE = "run.json"
+CHECKPOINT = "checkpoint.npz"
+LOG = "learning.csv"
+PARAMETERS = "parameters.toml"
+TRAINED = (LOG, PARAMETERS)
+"""Files of a finished training."""
+GREEDY = "greedy.csv"
+FAILURE = "failure.txt"
+RUN_FILES = (
     CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, TIMING,
     "trajectory-*.csv", "greedy-*.csv", "online*.csv",
 )  # fmt: skip
@@ -47,7 +53,8 @@ WRITTEN = (
 INDICATORS = (
     "J", "economic_cost", "mean_violation", "violating_share", "input_effort", "failures",
 )  # fmt: skip
-KEY = ["seed", "steps", "burn_in"]
+NOISE_KEY = ["seed", "steps", "burn_in"]
+"""Columns that say what noise a row was measured on."""
 TYPES: dict[str, Any] = {
     **dict.fromkeys(("scenario", "case", "status", "run"), str),
     **dict.fromkeys(("training_seed", "samples", "plant_samples"), "Int64"),
@@ -57,16 +64,27 @@ TYPES: dict[str, Any] = {
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 PAUSE = 20
 """Least time between two writes of the tables, in multiples of the time that one takes."""
-Figures = dict[str, Any]
+TRAINING = ""
+"""Stands for the training where a job is named by the file of its result."""
 
 
 def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = ()) -> pd.DataFrame:
-    """Columns of a CSV (default: all, the `needed` among them), `typed`; raises StudyError."""
+    """Read a CSV, its columns `typed`.
+
+    Args:
+        path: of the file.
+        columns: what is read; default: all.
+        needed: what must be there beside.
+
+    Raises:
+        StudyError: the file is missing or damaged.
+    """
     import pandas as pd  # noqa: PLC0415
 
     try:
         texts = pd.read_csv(path, dtype="string", keep_default_na=False, na_values=[""])
-        return typed(texts[list(dict.fromkeys([*(columns or texts), *needed]))])
+        wanted = dict.fromkeys([*(columns or texts), *needed])
+        return typed(texts[list(wanted)])
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise StudyError(f"'{path}' is missing or damaged: {error}") from None
 
@@ -84,32 +102,63 @@ def to_csv(frame: pd.DataFrame) -> str:
 # What a run is
 
 
-def safe(name: str) -> str:
-    """A folder's name on any system."""
+def folder_name(name: str) -> str:
+    """Replace characters that some file systems refuse in a name by `_`."""
     return re.sub(r"[^\w.+=()\[\]-]", "_", name)
 
 
 @dataclass(frozen=True)
-class Training:
-    """A training by its content.
+class TrainingJob:
+    """A training by its content: what `learning`'s `make_run` takes, but for the scenario.
 
-    `arguments` are those of `learning`'s `make_run` but for the scenario; `start` is the text
-    of the θ file at the start, None for a start with a name. In operation θ is judged at `marks`.
+    Attributes:
+        algorithm: a registered name, or `module:Class`.
+        samples: plant samples.
+        seed: of noise and exploration.
+        nmpc: the NMPC that carries θ, `rti` or `converged`.
+        start: where θ starts: a name, or a θ file.
+        theta: text of that θ file; None for a start with a name.
+        settings: the algorithm's hyperparameters by name.
+        options: further options of the training loop by name.
+        marks: in operation, the samples after which θ is evaluated; else empty.
     """
 
-    arguments: Mapping[str, Any]
-    start: str | None = None
+    algorithm: str
+    samples: int
+    seed: int
+    nmpc: str
+    start: str
+    theta: str | None
+    settings: Mapping[str, object]
+    options: Mapping[str, int | float | None]
     marks: tuple[int, ...] = ()
 
-    @property
-    def samples(self) -> int:
-        """Plant samples of the training."""
-        return int(self.arguments["samples"])
+    def make_run(self, scenario: Scenario) -> TrainingRun:
+        """The training on a scenario; raises what is wrong with it."""
+        from learning.training_run import make_run  # noqa: PLC0415
 
-    @property
-    def kind(self) -> str:
-        """The NMPC that carries θ."""
-        return str(self.arguments["options"]["controller"])
+        # What an option may be is checked there.
+        options: dict[str, Any] = dict(self.options)
+        return make_run(
+            self.algorithm,
+            scenario,
+            self.samples,
+            self.settings,
+            seed=self.seed,
+            start=self.start,
+            controller=self.nmpc,
+            **options,
+        )
+
+    def facts(self, start: str) -> dict[str, Any]:
+        """What the training's result depends on, with the start as the study's file names it."""
+        named = {"seed": self.seed, "controller": self.nmpc, "start": start}
+        return {
+            "algorithm": self.algorithm,
+            "samples": self.samples,
+            "settings": dict(self.settings),
+            "options": named | dict(self.options),
+        }
 
 
 @dataclass(frozen=True)
@@ -136,7 +185,7 @@ class Run:
     noise: Mapping[str, Noise]
     controller: ControllerSource | Factory | None = None
     seed: int | None = None
-    training: Training | None = None
+    training: TrainingJob | None = None
     kept: Mapping[str, str] = field(default_factory=dict)
     marks: Mapping[str, int] = field(default_factory=dict)
 
@@ -156,8 +205,8 @@ class Run:
     @property
     def folder(self) -> Path:
         """Where its files are, relative to the study's folder."""
-        parts = [safe(self.scenario.name), safe(self.case)]
-        return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
+        folder = Path(RUNS_FOLDER, folder_name(self.scenario.name), folder_name(self.case))
+        return folder if self.seed is None else folder / str(self.seed)
 
     def __str__(self) -> str:
         seed = "" if self.seed is None else f", seed {self.seed}"
@@ -166,7 +215,7 @@ class Run:
     def source(self, parameters: str) -> ControllerSource | Factory:
         """The controller; of a training the NMPC of the θ that a TOML text holds."""
         if self.training is not None:
-            return ControllerSource(PARAMETERS, parameters, self.training.kind)
+            return ControllerSource(PARAMETERS, parameters, self.training.nmpc)
         assert self.controller is not None
         return self.controller
 
@@ -196,67 +245,90 @@ def functions_for(noise: Mapping[str, Noise]) -> str:
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training gives: learning.csv and θ as texts, and what run.json says of it.
+    """What a training gives.
 
-    `about` holds `status` (`finished` or `diverged: …`), `samples`, `plant_samples`, `timing` in s.
+    Attributes:
+        log: learning.csv as text.
+        parameters: θ file as text.
+        status: `finished` or `diverged: …`.
+        samples: samples of the training that were done.
+        plant_samples: samples that were taken of the plant.
+        wall_seconds: time that the training took, in s.
+        processor_seconds: in operation the processor's time up to each mark, in s.
     """
 
     log: str
     parameters: str
-    about: Mapping[str, Any]
+    status: str
+    samples: int
+    plant_samples: int
+    wall_seconds: float = 0.0
+    processor_seconds: Mapping[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class TrainItem(Item[Trained]):
-    """A training; its checkpoint lies in `folder` where the workers share this disk."""
+    """A training as an item of work.
 
-    training: Training
+    Attributes:
+        training: what is done.
+        folder: of its checkpoint, where the workers share this disk.
+    """
+
+    training: TrainingJob
     folder: Path | None
 
     def run(self) -> Trained:
         """Train, from the checkpoint if there is one."""
-        from learning.training_run import make_run  # noqa: PLC0415
+        clock = time.perf_counter()
+        training = self.training
+        with temporary_folder("cosim-training-") as folder:
+            if training.theta is not None:
+                start = folder / "start.toml"
+                start.write_text(training.theta, "utf-8")
+                training = replace(training, start=str(start))
+            run = training.make_run(self.conditions.scenario)
+            if training.marks:
+                trained = _train_in_operation(run, training.marks)
+            else:
+                trained = _train_in_episodes(run, self.folder or folder)
+        return replace(trained, wall_seconds=time.perf_counter() - clock)
 
-        arguments, begin = dict(self.training.arguments), time.perf_counter()
-        options = dict(arguments.pop("options"))
-        with temporary_folder("cosim-training-") as own:
-            if self.training.start is not None:
-                (own / "start.toml").write_text(self.training.start, "utf-8")
-                options["start"] = str(own / "start.toml")
-            run = make_run(scenario=self.conditions.scenario, **arguments, **options)
-            trained = _in_operation if self.training.marks else _in_episodes
-            log, parameters, about = trained(run, self.training.marks, self.folder or own)
-        clock = about.pop("processor_seconds", {})
-        timing = {"wall_seconds": time.perf_counter() - begin, "processor_seconds": clock}
-        return Trained(log, parameters, about | {"timing": timing})
 
-
-def _in_operation(
-    run: TrainingRun, marks: Sequence[int], _: Path
-) -> tuple[str, str, dict[str, Any]]:
-    """Log, θ and facts of a training from one plant sample to the next."""
-    from cosim.studies import operation  # noqa: PLC0415
+def _train_in_operation(run: TrainingRun, marks: Sequence[int]) -> Trained:
+    """Train from one plant sample to the next."""
+    from cosim.studies.operation import run_in_operation  # noqa: PLC0415
     from learning.log import to_csv  # noqa: PLC0415
 
-    rows, status, clock, taken = operation.live(run, marks)
-    about = {"status": status, "samples": marks[-1], "plant_samples": taken}
-    return to_csv(rows), rows[-1].parameters.to_toml(), about | {"processor_seconds": clock}
+    done = run_in_operation(run, marks)
+    return Trained(
+        to_csv(done.rows),
+        done.rows[-1].parameters.to_toml(),
+        done.status,
+        samples=marks[-1],
+        plant_samples=done.plant_samples,
+        processor_seconds=done.processor_seconds,
+    )
 
 
-def _in_episodes(
-    run: TrainingRun, _: Sequence[int], folder: Path
-) -> tuple[str, str, dict[str, Any]]:
-    """Log, θ and facts of a training as `cosim train` does it, its checkpoint in a folder."""
+def _train_in_episodes(run: TrainingRun, folder: Path) -> Trained:
+    """Train as `cosim train` does it, with the checkpoint in a folder."""
     from learning.log import COLUMNS, LogRow, to_csv  # noqa: PLC0415
     from learning.training import run_training  # noqa: PLC0415
 
     result = run_training(run, folder, resume=(folder / CHECKPOINT).is_file())
-    samples = int(result.rows[-1]["samples"]) if result.rows else 0
     # The log of a study starts with θ at the start, from which its increments are counted.
-    start = dict.fromkeys(result.rows[0] if result.rows else COLUMNS, float("nan"))
-    rows = [LogRow(start | {"samples": 0.0}, result.start), *result.rows]
-    about = {"status": result.status, "samples": samples, "plant_samples": result.plant_samples}
-    return to_csv(rows), result.parameters.to_toml(), about
+    columns = result.rows[0] if result.rows else COLUMNS
+    start = dict.fromkeys(columns, float("nan"))
+    start["samples"] = 0.0
+    rows = [LogRow(start, result.start), *result.rows]
+    return Trained(
+        to_csv(rows),
+        result.parameters.to_toml(),
+        result.status,
+        samples=int(rows[-1]["samples"]),
+        plant_samples=result.plant_samples,
+    )
 
 
 # The folder of a run
@@ -277,40 +349,52 @@ class RunStore:
         self.run = run
         self.done = 0
         """Plant samples of the run that are done."""
-        self.sealed = False
+        self.complete = False
         """Whether all is done, and hashed in run.json."""
-        self._known: dict[str, dict[int, Figures]] = {}
+        self._measured: dict[str, dict[int, dict[str, Any]]] = {}
         self._unwritten: set[str] = set()
         self._quiet_until = 0.0
         if not self.folder.resolve().is_relative_to(out.resolve()):
             raise StudyError(f"'{self.folder}' leads out of '{out}'; choose another --out")
         (self.folder / FAILURE).unlink(missing_ok=True)
-        facts = json.loads(json.dumps(run.facts))
-        self.about = self._found()
-        before = self.about.get("facts")
-        unknown = [name for name, value in facts.items() if value == UNKNOWN]
-        if before != facts or unknown:
-            if before is not None and before != facts:
-                names = ", ".join(changed(before, facts))
-                self.remarks.append(f"{names} changed since these runs; they are done anew")
-            elif before is not None:
-                what = f"the code of {', '.join(unknown)} cannot be known"
-                self.remarks.append(f"{what}: {run} is done anew")
+        self.about = self._intact_run_file()
+        if self._is_of_other_facts():
             for path in self._files():
                 path.unlink()
             self.folder.mkdir(parents=True, exist_ok=True)
             self.about = {}
-            self._note(facts=facts, status="")
+            self._note(facts=self._facts(), status="")
         for file in run.noise:  # a damaged one is named before the work
             self.missing(file)
 
-    def _found(self) -> dict[str, Any]:
+    def _facts(self) -> dict[str, Any]:
+        """The run's facts as run.json holds them."""
+        return dict(json.loads(json.dumps(self.run.facts)))
+
+    def _is_of_other_facts(self) -> bool:
+        """Whether the folder's files do not hold for the run, or cannot be known to; say why."""
+        before = self.about.get("facts")
+        facts = self._facts()
+        unknown = [name for name, value in facts.items() if value == UNKNOWN]
+        if before == facts and not unknown:
+            return False
+        if before is None:
+            return True
+        if before != facts:
+            names = ", ".join(changed(before, facts))
+            self.remarks.append(f"{names} changed since these runs; they are done anew")
+        else:
+            what = f"the code of {', '.join(unknown)} cannot be known"
+            self.remarks.append(f"{what}: {self.run} is done anew")
+        return True
+
+    def _intact_run_file(self) -> dict[str, Any]:
         """run.json if it and its hashed files are intact, else {}."""
-        path = self.folder / RUN
+        path = self.folder / RUN_FILE
         if not path.is_file():
             if self._files():
                 raise StudyError(
-                    f"'{self.folder}' has no {RUN} and is no run of a study; move it away, or "
+                    f"'{self.folder}' has no {RUN_FILE} and is no run of a study; move it away, or "
                     "choose another --out"
                 )
             return {}
@@ -325,6 +409,7 @@ class RunStore:
             if file_hash(self.folder / name) == digest:
                 continue
             self.remarks.append(f"'{self.folder / name}' is not as it was written; made anew")
+            # Without its training no evaluation of the run holds.
             if name in TRAINED:
                 return {}
             (self.folder / name).unlink(missing_ok=True)
@@ -333,37 +418,41 @@ class RunStore:
 
     def _files(self) -> list[Path]:
         """Files of the folder that a run of a study writes, run.json apart."""
-        found = sorted(self.folder.glob("*"))
-        return [path for path in found if any(map(path.match, WRITTEN))]
+        files = []
+        for path in sorted(self.folder.glob("*")):
+            if any(path.match(pattern) for pattern in RUN_FILES):
+                files.append(path)
+        return files
 
     def _note(self, **values: Any) -> None:
         """Write values to run.json."""
         self.about = self.about | values
         text = json.dumps(self.about, indent=1, sort_keys=True) + "\n"
-        write_atomically(self.folder / RUN, text)
+        write_atomically(self.folder / RUN_FILE, text)
 
     @property
     def status(self) -> str:
         """How the training ended; empty while it has not."""
         return str(self.about.get("status", ""))
 
-    def indicators(self, file: str) -> dict[int, Figures]:
+    def indicators(self, file: str) -> dict[int, dict[str, Any]]:
         """Content of a file by noise seed, of runs as long as the plan's; {} of a damaged one."""
+        if file in self._measured:
+            return self._measured[file]
         path, noise = self.folder / file, self._noise(file)
-        if file in self._known:
-            return self._known[file]
-        found = self._known[file] = {}
+        measured: dict[int, dict[str, Any]] = {}
+        self._measured[file] = measured
         if path.is_file():
-            wanted = () if file == TIMING else INDICATORS
+            columns = () if file == TIMING else INDICATORS
             try:
-                rows = read_table(path, wanted, KEY).set_index("seed")
+                rows = read_table(path, columns, NOISE_KEY).set_index("seed")
             except StudyError:
                 self.remarks.append(f"'{path}' is damaged; made anew")
-                return found
+                return measured
             rows = rows[(rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)]
-            rows = rows[~rows.index.duplicated()].drop(columns=KEY[1:])
-            found |= rows.to_dict("index")
-        return found
+            rows = rows[~rows.index.duplicated()].drop(columns=["steps", "burn_in"])
+            measured.update(rows.to_dict("index"))
+        return measured
 
     def _noise(self, file: str) -> Noise:
         return self.run.noise[EVALUATION if file == TIMING else file]
@@ -383,52 +472,78 @@ class RunStore:
         return tuple(seed for seed in noise.seeds if seed not in self.indicators(file))
 
     def items(self, shared_disk: bool) -> Iterator[tuple[str, TrainItem | MeasureItem]]:
-        """What can be done now by the file of its result: the training (""), or evaluations."""
-        run, self.done = self.run, 0
+        """Give out what can be done now, and count what is done.
+
+        Args:
+            shared_disk: whether the workers see this disk.
+
+        Yields:
+            The file of the result, `TRAINING` for the training, and the item.
+        """
+        run = self.run
+        self.done = 0
         if run.training is not None:
             if not self.status:
                 self._unseal()
                 folder = self.folder.absolute() if shared_disk else None
-                yield "", TrainItem(run.conditions, run.training, folder)
+                yield TRAINING, TrainItem(run.conditions, run.training, folder)
                 return
             self.done = run.training.samples
         for file, noise in run.noise.items():
             missing = noise._replace(seeds=self.missing(file))
             self.done += noise.samples - missing.samples
             if missing.seeds:
-                yield from ((file, part) for part in self._evaluation(file, missing).parts())
+                for part in self._evaluation(file, missing).parts():
+                    yield file, part
 
     def _evaluation(self, file: str, noise: Noise) -> MeasureItem:
         """Evaluate the run's controller, or its θ, on some noise."""
-        run, mark = self.run, self.run.marks.get(file, 0)
-        trained = run.training is not None
-        controller = run.source((self.folder / PARAMETERS).read_text("utf-8") if trained else "")
-        theta: tuple[float, ...] = ()
-        plant = None
-        if mark:
-            from cosim.studies.operation import optimum_at, plant_at, theta_at  # noqa: PLC0415
+        run = self.run
+        parameters = ""
+        if run.training is not None:
+            parameters = (self.folder / PARAMETERS).read_text("utf-8")
+        item = MeasureItem(run.conditions, run.source(parameters), noise, run.length)
+        mark = run.marks.get(file)
+        if mark is None:
+            return item
+        # In operation: the policy of the time on the plant of the time.
+        from cosim.studies.operation import optimum_at, plant_at, theta_at  # noqa: PLC0415
 
-            plant = plant_at(run.scenario, mark * run.scenario.sampling_time)
-            if trained:
-                theta = theta_at((self.folder / LOG).read_text("utf-8"), mark)
-            else:
-                controller = partial(optimum_at, sample=mark)
-        return MeasureItem(run.conditions, controller, noise, run.length, theta, plant)
+        plant = plant_at(run.scenario, mark * run.scenario.sampling_time)
+        if run.training is None:
+            return replace(item, controller=partial(optimum_at, sample=mark), plant=plant)
+        theta = theta_at((self.folder / LOG).read_text("utf-8"), mark)
+        return replace(item, theta=theta, plant=plant)
 
-    def take(self, file: str, item: Item[Any], result: Trained | Measured) -> None:
-        """Store the result of an item; of a training run.json is written last."""
+    def store_training(self, result: Trained) -> None:
+        """Store the result of the training; run.json is written last."""
         self._unseal()
-        if isinstance(result, Trained):
-            for name, text in zip(TRAINED, (result.log, result.parameters), strict=True):
-                write_atomically(self.folder / name, text)
-            self.done = result.about["samples"]
-            files = {name: file_hash(self.folder / name) for name in TRAINED}
-            self._note(**result.about, files=files)
-            (self.folder / CHECKPOINT).unlink(missing_ok=True)
-            return
-        assert isinstance(item, MeasureItem)
-        self.done += item.noise.samples
-        if item.noise.whole:
+        write_atomically(self.folder / LOG, result.log)
+        write_atomically(self.folder / PARAMETERS, result.parameters)
+        self.done = result.samples
+        self._note(
+            status=result.status,
+            samples=result.samples,
+            plant_samples=result.plant_samples,
+            timing={
+                "wall_seconds": result.wall_seconds,
+                "processor_seconds": dict(result.processor_seconds),
+            },
+            files={name: file_hash(self.folder / name) for name in TRAINED},
+        )
+        (self.folder / CHECKPOINT).unlink(missing_ok=True)
+
+    def store_measurement(self, file: str, noise: Noise, result: Measured) -> None:
+        """Store the result of an evaluation.
+
+        Args:
+            file: of the result.
+            noise: what was measured on.
+            result: indicators and times by noise seed, or one trajectory.
+        """
+        self._unseal()
+        self.done += noise.samples
+        if noise.whole:
             write_atomically(self.folder / file, result.trajectory)
             return
         self.indicators(file).update(result.indicators)
@@ -444,21 +559,24 @@ class RunStore:
         import pandas as pd  # noqa: PLC0415
 
         # A table is written whole each time: the pause keeps that a small share of the work.
-        begin = time.monotonic()
+        clock = time.monotonic()
         while self._unwritten:
             file = self._unwritten.pop()
-            rows, noise = pd.DataFrame.from_dict(self._known[file], "index"), self._noise(file)
-            rows = rows.sort_index() if file == TIMING else rows.sort_index()[list(INDICATORS)]
-            for place, value in enumerate((rows.index, noise.steps, noise.burn_in)):
-                rows.insert(place, KEY[place], value)
+            noise = self._noise(file)
+            rows = pd.DataFrame.from_dict(self._measured[file], "index").sort_index()
+            if file != TIMING:
+                rows = rows[list(INDICATORS)]
+            rows.insert(0, "seed", rows.index)
+            rows.insert(1, "steps", noise.steps)
+            rows.insert(2, "burn_in", noise.burn_in)
             write_atomically(self.folder / file, to_csv(rows))
-        self._quiet_until = time.monotonic() + PAUSE * (time.monotonic() - begin)
+        self._quiet_until = time.monotonic() + PAUSE * (time.monotonic() - clock)
 
     def seal(self) -> None:
         """Write the hashes of a finished run's files to run.json."""
         trained = self.run.training is None or bool(self.status)
-        self.sealed = trained and not any(map(self.missing, self.run.noise))
-        if self.sealed:
+        self.complete = trained and not any(self.missing(file) for file in self.run.noise)
+        if self.complete:
             self.flush()
             files = {path.name: file_hash(path) for path in self._files() if path.name != TIMING}
             if self.about.get("files") != files:
@@ -474,72 +592,112 @@ class RunStore:
 # The giving out of the work
 
 
+class WorkKey(NamedTuple):
+    """An item of work: its run, the file of its result, and its number among those of the run."""
+
+    run: str
+    file: str
+    number: int
+
+
 class Runner:
-    """Does what the folders of runs lack; raises StudyError if two runs have one folder."""
+    """Do what the folders of runs lack.
+
+    Args:
+        runs: the runs of a study.
+        out: its folder.
+        report: called with the samples done, the state of the runs and a line, after each item.
+
+    Raises:
+        StudyError: two runs have one folder.
+    """
 
     def __init__(self, runs: list[Run], out: Path, report: Progress):
         self._report = report
-        taken: dict[str, Run] = {}
+        by_folder: dict[str, Run] = {}
         for run in runs:  # upper and lower case are equal on some systems
-            other = taken.setdefault(str(run.folder).lower(), run)
+            other = by_folder.setdefault(str(run.folder).lower(), run)
             if other is not run:
                 raise StudyError(f"'{run}' and '{other}' would have one folder; rename one of them")
         self.stores = {str(run): RunStore(out, run) for run in runs}
         self.failures: dict[str, Failure] = {}
         """The first failure of each run that failed."""
-        self.remarks = list(dict.fromkeys(x for s in self.stores.values() for x in s.remarks))
+        self.remarks: list[str] = []
         """What was changed or damaged and is done anew, in words."""
+        for store in self.stores.values():
+            for remark in store.remarks:
+                if remark not in self.remarks:
+                    self.remarks.append(remark)
 
     def run(self, jobs: int, scheduler: str | None) -> None:
         """Do all that is not done; failed runs do not stop the others.
 
-        Raises EvaluationError where no worker can work.
+        Args:
+            jobs: worker processes; 1 works in this process.
+            scheduler: address of a Dask scheduler, used in place of `jobs`.
+
+        Raises:
+            EvaluationError: no worker can work.
         """
         try:
-            while items := self._missing(shared_disk=scheduler is None):
+            # What a training leaves to evaluate is found once it is done.
+            while items := self._items(shared_disk=scheduler is None):
                 for key, result in done(items, jobs, scheduler):
-                    self._take(*key[:2], items[key], result)
+                    if isinstance(result, Failure):
+                        self._note_failure(key.run, result)
+                    else:
+                        self._store(key, items[key], result)
         finally:
             for store in self.stores.values():
                 store.flush()
 
-    def _missing(self, shared_disk: bool) -> dict[tuple[str, str, int], Item[Any]]:
-        """Items by run, file and number."""
-        items: dict[tuple[str, str, int], Item[Any]] = {}
+    def _items(self, shared_disk: bool) -> dict[WorkKey, Item[Any]]:
+        """What can be done now."""
+        items: dict[WorkKey, Item[Any]] = {}
         for name, store in self.stores.items():
-            if name not in self.failures and not store.sealed:
-                for number, (file, item) in enumerate(store.items(shared_disk)):
-                    items[name, file, number] = item
-                store.seal()
+            if name in self.failures or store.complete:
+                continue
+            for number, (file, item) in enumerate(store.items(shared_disk)):
+                items[WorkKey(name, file, number)] = item
+            store.seal()
         self._tell("")
         return items
 
-    def _take(
-        self, name: str, file: str, item: Item[Any], result: Trained | Measured | Failure
-    ) -> None:
-        """Store and report the result of an item."""
-        store, line = self.stores[name], ""
-        if isinstance(result, Failure):
-            if name in self.failures:
-                return
-            self.failures[name] = result
-            write_atomically(store.folder / FAILURE, result.traceback)
-            self._tell(f"failed: {name}: {result.message}")
+    def _note_failure(self, name: str, failure: Failure) -> None:
+        """Store and report the first failure of a run."""
+        if name in self.failures:
             return
-        store.take(file, item, result)
-        if isinstance(result, Trained):
-            line = "" if store.status == "finished" else f"{name}: {store.status}"
-        else:
+        self.failures[name] = failure
+        write_atomically(self.stores[name].folder / FAILURE, failure.traceback)
+        self._tell(f"failed: {name}: {failure.message}")
+
+    def _store(self, key: WorkKey, item: Item[Any], result: Any) -> None:
+        """Store and report the result of an item."""
+        store = self.stores[key.run]
+        line = ""
+        if isinstance(item, MeasureItem):
+            store.store_measurement(key.file, item.noise, result)
             store.seal()
-        if store.sealed:
-            found, seeds = store.indicators(EVALUATION), store.run.noise[EVALUATION].seeds
-            status = store.status.partition(":")[0]
-            line = f"{name}: J {sum(found[seed]['J'] for seed in seeds) / len(seeds):.6g}"
-            line += f", {status}" if status else ""
+        else:
+            store.store_training(result)
+            if store.status != "finished":
+                line = f"{key.run}: {store.status}"
+        if store.complete:
+            line = _end_of_run(key.run, store)
         self._tell(line)
 
     def _tell(self, line: str) -> None:
-        failed = f", {len(self.failures)} failed" if self.failures else ""
-        sealed = sum(store.sealed for store in self.stores.values())
-        runs = f"{sealed}/{len(self.stores)} runs{failed}"
-        self._report(sum(store.done for store in self.stores.values()), runs, line)
+        complete = sum(store.complete for store in self.stores.values())
+        state = f"{complete}/{len(self.stores)} runs"
+        if self.failures:
+            state += f", {len(self.failures)} failed"
+        self._report(sum(store.done for store in self.stores.values()), state, line)
+
+
+def _end_of_run(name: str, store: RunStore) -> str:
+    """A line on a run that is done."""
+    indicators = store.indicators(EVALUATION)
+    costs = [indicators[seed]["J"] for seed in store.run.noise[EVALUATION].seeds]
+    line = f"{name}: J {sum(costs) / len(costs):.6g}"
+    status = store.status.partition(":")[0]
+    return f"{line}, {status}" if status else line

@@ -26,28 +26,30 @@ from cosim.studies.results import (
     ABOUT,
     AGGREGATE,
     CURVES,
-    KEYS,
     OPERATION,
+    RUN_KEYS,
+    RUNS_TABLE,
     SUMMARY,
     WHERE,
     StudyResults,
 )
-from cosim.studies.results import RUNS as RUNS_TABLE
-from cosim.studies.run import GREEDY, RUNS, to_csv
+from cosim.studies.run import GREEDY, RUNS_FOLDER, to_csv
 
-TOLERANCES, DIGITS = "tolerances.toml", 8
+TOLERANCES = "tolerances.toml"
+DIGITS = 8
+"""Significant digits of stored numbers."""
 WORK = ".work"
 """Folder within the folder, of the runs of studies."""
 WORDS = ("status", "against", "hash")
 """Columns that hold words, which must be the same; every other one holds numbers."""
 KEY_COLUMNS = {
-    EVALUATION: [*KEYS, "seed"],
-    CURVES: [*KEYS, "samples"],
-    RUNS_TABLE: KEYS,
+    EVALUATION: [*RUN_KEYS, "seed"],
+    CURVES: [*RUN_KEYS, "samples"],
+    RUNS_TABLE: RUN_KEYS,
     SUMMARY: WHERE,
     AGGREGATE: ["case"],
-    OPERATION: [*KEYS, "samples"],
-    GREEDY: [*KEYS, "samples", "seed"],
+    OPERATION: [*RUN_KEYS, "samples"],
+    GREEDY: [*RUN_KEYS, "samples", "seed"],
     LOGS: ["samples"],
     TRAJECTORIES: ["time"],
     THETA: ["schema"],
@@ -95,7 +97,12 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     for path in sorted(out.rglob("*")):
         relative = path.relative_to(out)
         kept = path.suffix in SUFFIXES or path.name == ABOUT
-        if not path.is_file() or relative.parts[0] == RUNS or path.name == TIMING or not kept:
+        if (
+            not path.is_file()
+            or relative.parts[0] == RUNS_FOLDER
+            or path.name == TIMING
+            or not kept
+        ):
             continue
         content = path.read_bytes()
         if path.suffix == ".csv":  # a last bit is no change
@@ -110,7 +117,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     return left_out
 
 
-def draw(folder: Path, name: str) -> list[str]:
+def draw_stored(folder: Path, name: str) -> list[str]:
     """Draw the figures of a stored study, from its tables alone, as NAME/figures/*.svg.
 
     Args:
@@ -129,7 +136,7 @@ def draw(folder: Path, name: str) -> list[str]:
     for of_scenario in results.draw(stored / FOLDER, ("svg",)).values():
         names += of_scenario
     if results.about["pictures"]:  # of the trajectories and logs that the study keeps
-        names += figures.draw(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
+        names += figures.draw_kept(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
     return names
 
 
@@ -177,7 +184,7 @@ def compared_tables(folder: Path) -> dict[str, list[str]]:
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
         top = relative.parts[0]
-        if path.suffix not in (".csv", ".toml") or relative.name == TIMING or top == RUNS:
+        if path.suffix not in (".csv", ".toml") or relative.name == TIMING or top == RUNS_FOLDER:
             continue
         keys = KEY_COLUMNS.get(top)
         if keys is None:
@@ -245,12 +252,16 @@ def _read(path: Path, keys: list[str]) -> pd.DataFrame:
         name, _, unit = title.partition(" [")
         names[title] = name
         units[name] = unit.removesuffix("]")
-    frame = frame.rename(columns=names)
+    columns: dict[str, list[str] | list[float]] = {}
     try:
-        frame = frame.map(_rounded).set_index(keys)
-        numbers = [column for column in frame if column not in WORDS]
-        frame = frame.replace(dict.fromkeys(numbers, ""), "nan")
-        frame = frame.astype(dict.fromkeys(numbers, float))
+        for title in frame:
+            name = names[title]
+            cells = [_rounded(cell) for cell in frame[title]]
+            if name in keys or name in WORDS:
+                columns[name] = cells
+            else:
+                columns[name] = [float(cell or "nan") for cell in cells]
+        frame = pd.DataFrame(columns).set_index(keys)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the stored table '{path}' is damaged: {error}") from None
     if not frame.index.is_unique:
@@ -290,14 +301,16 @@ def _table_differences(
             lost.append(f"{name}: signal {', '.join(lone)} is {columns}")
     common = stored.index.intersection(now.index, sort=False)
     units = now.attrs | stored.attrs
+    # Taken once: to take them for each signal is most of the time that a check needs.
+    stored_rows, rows_now = stored.loc[common], now.loc[common]
     first: list[tuple[int, str]] = []
     for signal in stored.columns.intersection(now.columns, sort=False):
-        before, after = stored.loc[common, signal], now.loc[common, signal]
+        before, after = stored_rows[signal].to_numpy(), rows_now[signal].to_numpy()
         if signal in WORDS:
-            differs = (before != after).to_numpy()
+            differs = before != after
             bound = ""
         else:
-            tolerance = _tolerance(signal, units[signal], tolerances)
+            tolerance = _tolerance_of(signal, units[signal], tolerances)
             differs = ~np.isclose(after, before, 0.0, tolerance.absolute, equal_nan=True)
             bound = f", tolerance {tolerance.absolute:g} {tolerance.unit.removeprefix('1')}"
         if not differs.any():
@@ -310,18 +323,18 @@ def _table_differences(
     return lines + in_order_of_rows + lost
 
 
-def _tolerance(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
+def _tolerance_of(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
     """The signal's own tolerance, else the first matching pattern's (`theta *`)."""
-    fitting = (name for name in tolerances if fnmatchcase(signal, name))
-    name = signal if signal in tolerances else next(fitting, None)
-    if name is None:
+    names = [signal, *(name for name in tolerances if fnmatchcase(signal, name))]
+    known = [name for name in names if name in tolerances]
+    if not known:
         raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
-    if unit and unit != tolerances[name].unit:
+    tolerance = tolerances[known[0]]
+    if unit and unit != tolerance.unit:
         raise ResultsError(
-            f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in "
-            f"'{tolerances[name].unit}'"
+            f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in '{tolerance.unit}'"
         )
-    return tolerances[name]
+    return tolerance
 
 
 def _row(table: pd.DataFrame, row: object) -> str:

@@ -4,7 +4,7 @@ import pytest
 import rich.progress
 
 from cosim import FmuPlant, build_controller, evaluate, simulate, train
-from tests.helpers.toy_study import run_toy
+from tests.helpers.toy_study import case, run_toy
 
 
 def a_simulation(paper, _):
@@ -22,7 +22,7 @@ def an_evaluation(paper, _):
 
 
 def a_study(_, folder):
-    run_toy(folder, report=True)
+    run_toy(folder, report=True, case=[case("grow", samples=100)], training_seeds={"count": 1})
 
 
 @pytest.mark.parametrize("work", [a_simulation, a_training, an_evaluation, a_study])

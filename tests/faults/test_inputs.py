@@ -31,7 +31,7 @@ STATED = {
 }
 PAPER = Scenario.load("paper").replace(STATED).to_dict()
 OPTIONS = settings(
-    max_examples=150,
+    max_examples=100,
     deadline=None,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -117,7 +117,7 @@ CONFIGURATIONS = {load_algorithm(name).Configuration: name for name in algorithm
 
 @pytest.mark.parametrize("configuration", CONFIGURATIONS, ids=CONFIGURATIONS.get)
 def test_any_value_of_any_hyperparameter_is_kept_or_refused(configuration):
-    @settings(OPTIONS, max_examples=100)
+    @settings(OPTIONS, max_examples=30)
     @given(st.sampled_from(sorted(configuration.model_fields)), values)
     def attack(field, value):
         try:
@@ -133,8 +133,8 @@ def test_any_value_of_any_hyperparameter_is_kept_or_refused(configuration):
 
 # The command line ------------------------------------------------------------------------------
 
-BAD = {int: ["nan", "-1", "1" * 30], float: ["nan", "inf", "-1"]}
-# These are no numbers to the one parser, so each option meets one of them.
+# Each option meets one of the first, and one of the second, which are no numbers to the parser.
+BAD = {int: cycle(["nan", "-1", "1" * 30]), float: cycle(["nan", "inf", "-1"])}
 UNREADABLE = {int: cycle(["x", "1.5", "", "1e3"]), float: cycle(["x", "", "1,5"])}
 
 
@@ -150,6 +150,7 @@ def commands(command=None, words=()):
 
 
 def numeric_options():
+    """Words of a command with a bad value for one numeric option, of each kind in turn."""
     for words, command in commands():
         needed = ["a" for p in command.params if p.required and p.param_type_name == "argument"] + [
             word
@@ -161,7 +162,7 @@ def numeric_options():
             kind = parameter.type_descriptor.annotation
             if kind not in BAD or parameter.param_type_name != "option":
                 continue
-            for bad in (next(UNREADABLE[kind]), *BAD[kind]):
+            for bad in (next(UNREADABLE[kind]), next(BAD[kind])):
                 is_seed = bad.isdigit() and parameter.opts[0] in (
                     "--seed",
                     "--first-seed",
@@ -189,44 +190,32 @@ WRONG = [
     "simulate --scenario papr",
     "simulate --controller nave",
     "simulate --controller json:make",
-    "simulate --controller json:loads",
-    "simulate --controller builtins:type",
     "simulate --controller no-theta.toml",
     "simulate --controller type.toml",
-    "simulate --controller controllers.errors:QpError",
     "simulate --out blocked/inside --steps 3",
-    "evaluate --controllers ,",
     "evaluate --scheduler nonsense --steps 3 --seeds 1",
     "evaluate --first-seed 18446744073709551610 --seeds 10 --steps 3",
     "train --algorithm nothing",
-    "train --algorithm a:b",
-    "train --algorithm q-learning --set nothing",
     "train --algorithm q-learning --set step_size=zero",
-    "train --algorithm q-learning --resume",
-    "train --algorithm q-learning --controller mpc",
     "train --algorithm q-learning --evaluate-every 70 --log-every 60",
     "fmu info none.fmu",
     "fmu info blocked",
-    "fmu check none.fmu",
-    "fmu check blocked",
-    "fmu build",
-    "fmu build --check --out x",
-    "fmu build . --out x",
-    "fmu build . --out x.fmu",
-    "fmu build --out blocked",
     "view blocked --json",
-    "new rule json",
-    "new plant 2_tanks",
     "new study class",
     "compare blocked blocked",
+    "simulate --scenario folder.toml",
+    "train --algorithm fixed --start folder.toml",
+    "study run folder.toml",
+    "scenario init evaporator --out folder.toml",
+    "export tuned --local --out folder.toml",
     "results check --results nowhere",
-    "results update --results nowhere",
 ]
 
 
 @pytest.mark.parametrize("line", WRONG)
 def test_a_wrong_name_is_one_line_and_exit_code_2(cosim, tmp_path, line):
     (tmp_path / "blocked").write_text("this is no folder, and no file of any known kind\n")
+    (tmp_path / "folder.toml").mkdir()
     (tmp_path / "type.toml").write_text('extends = "paper"\ndiscount = "high"\n')
     code, out, err = cosim(*line.split())
     assert code == 2, err
@@ -234,15 +223,14 @@ def test_a_wrong_name_is_one_line_and_exit_code_2(cosim, tmp_path, line):
     last = [text for text in err.splitlines() if text.strip()]
     assert last[-1].startswith("error: ")
     assert not out.strip()
+    assert not list((tmp_path / "folder.toml").iterdir())
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "simulate --steps 3",
         "evaluate --seeds 1 --steps 3 --jobs 1",
         "train --algorithm q-learning --samples 20 --log-every 20 --evaluate-every 20",
-        "tuning",
     ],
 )
 def test_a_command_that_needs_the_model_left_out_says_so(cosim, tmp_path, line):

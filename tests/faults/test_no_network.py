@@ -15,9 +15,6 @@ SCRIPT = Path(__file__).parents[1] / "helpers" / "no_network.py"
 COMMANDS = {
     "simulate": ["simulate", "-n", "50", "--record", "--out", "run"],
     "train": ["train", "-a", "q-learning", "-n", "500", "--evaluate-every", "1000", "--out", "t"],
-    "evaluate": ["evaluate", "--controllers", "naive", "--seeds", "2", "--steps", "20", "-o", "e"],
-    "fmu check": ["fmu", "info", "evaporator"],
-    "optimum": ["optimum", "--scenario", "paper"],
     "view": ["view", "run/run.rrd", "--png", "run.png"],
 }
 

@@ -8,14 +8,8 @@ import pytest
 
 COMMAND = [sys.executable, "-m", "cosim"]
 ASCII = {"PYTHONIOENCODING": "ascii", "LC_ALL": "C", "PYTHONUTF8": "0"}
-# Of a table with Greek letters, of a document, of help, and of an error that has none of ASCII.
-WORDS = {
-    "table": ["scenario"],
-    "document": ["scenario", "--json"],
-    "help": ["evaluate", "--help"],
-    "error": ["scenario", "θ.toml"],
-}
-CODES = {"table": 0, "document": 0, "help": 0, "error": 2}
+WORDS = {"a table with Greek letters": ["scenario"], "an error with one": ["scenario", "θ.toml"]}
+CODES = {"a table with Greek letters": 0, "an error with one": 2}
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="descriptors of POSIX")
 
 
@@ -39,22 +33,9 @@ def test_what_an_encoding_lacks_is_escaped(tmp_path, kind):
     done.stderr.decode("ascii")
 
 
-REDIRECTIONS = {
-    "no output": ">&-",
-    "no errors": "2>&-",
-    "no stream": "<&- >&- 2>&-",
-    "a full device": "> /dev/full",
-    "a reader that goes away": "| true",
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", WORDS)
-@pytest.mark.parametrize("what", REDIRECTIONS)
-def test_a_stream_that_cannot_be_written_ends_in_no_traceback(tmp_path, kind, what):
-    done = shell(tmp_path, WORDS[kind], REDIRECTIONS[what])
+@pytest.mark.parametrize("redirection", ["<&- >&- 2>&-", "> /dev/full", "| true"])
+def test_a_stream_that_cannot_be_written_ends_in_no_traceback(tmp_path, redirection):
+    done = shell(tmp_path, ["scenario"], redirection)
     assert b"Traceback" not in done.stderr
-    if what.startswith("no "):
-        assert done.returncode == CODES[kind], done.stderr
-    elif what == "a full device":
-        assert done.returncode != 0
+    assert (done.returncode != 0) is ("full" in redirection), done.stderr

@@ -5,12 +5,17 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from cosim import study
+from cosim import Scenario, study
+from cosim.core.modules import import_from
 from learning.configuration import Configuration
 from learning.errors import DivergenceError
 
-HERE = "tests.helpers.toy_study"
+HERE = "toy_study"
+"""Its name where it is a plug-in: in a folder of its own, so that no other file counts."""
+import_from(Path(__file__).parent)
 GROW = f"{HERE}:Grow"
+SCENARIO = {"extends": "paper", "name": "paper", "controller": {"horizon": 2}}
+"""`paper` with a short horizon: its controllers are built in half of the time."""
 
 
 class ToyConfiguration(Configuration):
@@ -63,7 +68,7 @@ class Interrupt(Grow):
     def observe(self, transition):
         super().observe(transition)
         marker = Path(self._configuration.marker)
-        if transition.number == 700 and not marker.exists():
+        if transition.number == 250 and not marker.exists():
             marker.touch()
             raise KeyboardInterrupt
 
@@ -77,11 +82,17 @@ def document(**changes):
         "schema": 1,
         "name": "toy",
         "scenarios": ["paper"],
+        "scenario": [SCENARIO],
         "training_seeds": {"first": 0, "count": 2},
         "evaluation": {"seeds": 3, "steps": 30},
         "curves": {"points": 4, "seeds": 2, "steps": 20},
         "case": [case("grow", settings={"rate": [1.0, 2.0]}), {"controller": ["naive", "optimal"]}],
     } | changes
+
+
+def toy_scenario():
+    """The scenario of the studies."""
+    return Scenario.load("paper").replace({"controller": SCENARIO["controller"]})
 
 
 def run_toy(out, *, jobs=1, report=lambda *state: None, **changes):

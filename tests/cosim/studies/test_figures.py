@@ -7,6 +7,7 @@ import pytest
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures.style import lighten, palette, shown_case
 from cosim.studies.figures import (
+    LearningCurve,
     curves_figure,
     density_figure,
     increments,
@@ -45,10 +46,10 @@ def test_a_curve_averages_training_since_the_point_before_and_holds_diverged_run
         columns=["training_seed", "samples", "J", "greedy_J"],
     )  # fmt: skip
     curve = learning_curve(log, None)
-    assert curve["samples"].tolist() == [1000, 2000]
-    assert curve["training"].tolist() == [[3.0, 6.0], [7.0, 7.0]]
-    assert curve["greedy"].tolist() == [[9.0, 8.0], [5.0, 5.0]]
-    assert learning_curve(log, 4.0)["greedy"][0].tolist() == [125.0, 100.0]
+    assert curve.samples.tolist() == [1000, 2000]
+    assert curve.training.tolist() == [[3.0, 6.0], [7.0, 7.0]]
+    assert curve.greedy.tolist() == [[9.0, 8.0], [5.0, 5.0]]
+    assert learning_curve(log, 4.0).greedy[0].tolist() == [125.0, 100.0]
 
 
 def test_a_dark_ground_hides_no_controller():
@@ -73,7 +74,7 @@ def test_a_cases_settings_are_set_after_its_name():
 
 def test_many_curves_have_a_panel_for_each_start():
     values = np.array([[3.0, 2.0]])
-    one = {"samples": np.array([100.0, 200.0]), "training": values, "greedy": values}
+    one = LearningCurve(np.array([100.0, 200.0]), values, values)
     cases = [f"{rule}(start={start})" for start in ("naive", "tuned") for rule in "abcd"]
     axes = curves_figure(dict.fromkeys(cases, one), {}, palette(cases), relative=True).axes
     assert [panel.get_title() for panel in axes] == ["from naive", "from tuned", "", ""]

@@ -2,34 +2,44 @@ import numpy as np
 import pandas as pd
 
 from cosim import study
-from cosim.studies.operation import LIFE, SHIFT, dearer_than, judged, tables
+from cosim.studies.operation import (
+    OPERATION_METRICS,
+    SHIFT,
+    OperationLayout,
+    compare_shifts,
+    operation_result,
+    operation_tables,
+)
+from tests.helpers.toy_study import SCENARIO
 
 
 def test_noise_alone_makes_no_shift_dearer_and_a_dearer_one_is_found(rng):
     before = rng.gamma(2.0, 100.0, (200, 21 * SHIFT))
     cost = before + rng.normal(0.0, 50.0, before.shape)
-    called = [dearer_than(*pair)[0] > 0 for pair in zip(before, cost, strict=True)]
+    called = [compare_shifts(*pair)[0] > 0 for pair in zip(before, cost, strict=True)]
     assert np.mean(called) < 0.1  # 5 % of lives
     cost[0, 480:960] += 25.0
-    number, excess = dearer_than(before[0], cost[0])
+    number, excess = compare_shifts(before[0], cost[0])
     assert number == 1 and abs(excess - 25.0) < 10.0
 
 
 def test_a_run_that_diverged_is_dearer_in_each_shift_since():
     cost = np.ones(4 * SHIFT)
     cost[SHIFT:] = np.inf
-    assert dearer_than(np.ones(4 * SHIFT), cost) == (3.0, np.inf)
-    assert np.isnan(dearer_than(cost[:10], cost[:10])).all()
+    assert compare_shifts(np.ones(4 * SHIFT), cost) == (3.0, np.inf)
+    assert np.isnan(compare_shifts(cost[:10], cost[:10])).all()
 
 
 def test_a_study_in_operation_without_a_training_has_a_report(tmp_path):
     document = {"schema": 1, "name": "fixed", "scenarios": ["paper"], "operation": {"hours": [1]}}
+    document["scenario"] = [SCENARIO]
     document |= {"case": [{"controller": "naive"}], "evaluation": {"seeds": 2, "steps": 10}}
     assert study(document | {"curves": {"seeds": 2, "steps": 10}}, tmp_path).report().is_file()
 
 
 def test_a_study_in_operation_keeps_a_log_without_a_picture_of_it(tmp_path):
     document = {"schema": 1, "name": "fixed", "scenarios": ["paper"], "operation": {"hours": [1]}}
+    document["scenario"] = [SCENARIO]
     document |= {"case": [{"name": "h", "algorithm": "fixed"}], "training_seeds": {"count": 1}}
     document |= {"evaluation": {"seeds": 1, "steps": 20}, "curves": {"seeds": 2, "steps": 10}}
     study(document | {"logs": ["h"]}, tmp_path)
@@ -44,9 +54,11 @@ def test_cases_with_other_training_seeds_are_compared_on_those_that_both_have():
         for seed, J in enumerate(costs)
     ]
     greedy = [row | {"seed": noise} for row in rows for noise in (5, 6)]
-    lives = pd.DataFrame([dict.fromkeys(LIFE, 0.0) | row for row in rows])
-    found = judged(lives, pd.DataFrame(greedy), "optimal")
-    about = {"sampling_time": 60.0, "columns": [10]}
-    *_, (_, _, ((pair, difference),)) = tables(found, "paper", about, {"a": "b", "b": None}, {})
+    lives = pd.DataFrame([dict.fromkeys(OPERATION_METRICS, 0.0) | row for row in rows])
+    found = operation_result(lives, pd.DataFrame(greedy), "optimal")
+    layout = OperationLayout(60.0, [10])
+    *_, (_, _, ((pair, difference),)) = operation_tables(
+        found, "paper", layout, {"a": "b", "b": None}, {}
+    )
     assert pair == "a − b"
     assert difference.startswith("5.00")

@@ -6,11 +6,19 @@ import pytest
 from scipy import stats
 
 from controllers.factories import nmpc
-from cosim import FmuPlant, Scenario, study
+from cosim import FmuPlant, study
 from cosim.core.simulation import spawn_seeds
-from cosim.studies.operation import LIFE, SHIFT, dearer_than, judged, metrics, tables
+from cosim.studies.operation import (
+    OPERATION_METRICS,
+    SHIFT,
+    OperationLayout,
+    compare_shifts,
+    operation_metrics,
+    operation_result,
+    operation_tables,
+)
 from learning.training_run import make_run
-from tests.helpers.toy_study import case, document
+from tests.helpers.toy_study import case, document, toy_scenario
 
 NOBODY = np.zeros(1000, dtype=bool)
 
@@ -20,11 +28,11 @@ def of_costs(cost, before=None, violating=NOBODY, first_change=0, samples=None):
     cost = np.asarray(cost, dtype=float)
     before = cost if before is None else np.asarray(before, dtype=float)
     samples = len(cost) if samples is None else samples
-    return metrics(samples, before, cost, violating, first_change)
+    return operation_metrics(samples, before, cost, violating, first_change)
 
 
 def test_every_column_of_the_tables_is_a_metric_or_a_number_so_far():
-    assert {*of_costs([1.0]), "updates", "model_samples"} == {"samples", *LIFE}
+    assert {*of_costs([1.0]), "updates", "model_samples"} == {"samples", *OPERATION_METRICS}
 
 
 def test_j_is_the_mean_of_all_samples_so_far_those_before_the_first_change_too():
@@ -96,7 +104,7 @@ def test_a_shift_is_dearer_by_a_one_sided_t_test_of_its_eighths_corrected_for_th
     p = stats.ttest_1samp(eighths, 0.0, axis=1, alternative="greater").pvalue
     assert ((p < 0.05) == [True, False, True, False]).all()
     cost = np.repeat(eighths.ravel(), SHIFT // 8)
-    number, excess = dearer_than(np.zeros(shifts * SHIFT), cost)
+    number, excess = compare_shifts(np.zeros(shifts * SHIFT), cost)
     assert number == (p < 0.05 / shifts).sum() == 1
     assert excess == 4.5
 
@@ -105,7 +113,7 @@ def lives(*rows):
     """Rows of operation.csv: case, training seed, samples, J; and further columns by name."""
     columns = ["case", "training_seed", "samples", "J"]
     frame = pd.DataFrame([dict(zip(columns, row, strict=False)) | row[4] for row in rows])
-    return frame.reindex(columns=[*columns, *(name for name in LIFE if name != "J")])
+    return frame.reindex(columns=[*columns, *(name for name in OPERATION_METRICS if name != "J")])
 
 
 def greedy(*rows):
@@ -136,11 +144,11 @@ def found():
         ("b", 2, 480, 7, 20.0),
         ("b", 2, 480, 8, 22.0),
     )
-    return judged(run, held_out, "optimal")
+    return operation_result(run, held_out, "optimal")
 
 
 def test_regrets_of_a_run_are_against_the_optimum_on_the_same_noise(found):
-    rows = found.lives.set_index(["case", "training_seed"])
+    rows = found.runs.set_index(["case", "training_seed"])
     assert rows.regret["a", 1] == pytest.approx(22 / 20 - 1)
     assert rows.regret["a", 2] == pytest.approx(30 / 20 - 1)
     assert rows.life_regret["a", 1] == pytest.approx(12 / 10 - 1)
@@ -155,17 +163,17 @@ def test_regrets_of_a_run_are_against_the_optimum_on_the_same_noise(found):
 def test_a_plant_that_earns_money_has_a_positive_regret_where_it_earns_less():
     run = lives(("optimal", 1, 480, -10.0, {}), ("a", 1, 480, -8.0, {"dearest": -5.0}))
     held_out = greedy(("optimal", None, 480, 7, -20.0), ("a", 1, 480, 7, -15.0))
-    (row,) = judged(run, held_out, "optimal").lives.to_dict("records")
+    (row,) = operation_result(run, held_out, "optimal").runs.to_dict("records")
     assert row["regret"] == pytest.approx(0.25)
     assert row["life_regret"] == pytest.approx(0.2)
     assert row["dearest"] == pytest.approx(0.5)
 
 
 def test_the_tables_show_medians_and_worst_runs_in_per_cent(found):
-    about = {"sampling_time": 60.0, "columns": [480]}
+    layout = OperationLayout(60.0, [480])
     by_title = {
         title.partition(":")[0]: rows
-        for title, _, rows in tables(found, "paper", about, {"a": "b", "b": None}, {})
+        for title, _, rows in operation_tables(found, "paper", layout, {"a": "b", "b": None}, {})
     }
     regret, run, took, shifts, paired = by_title.values()
     assert regret[0] == ["a", "30.0 (50.0)"]  # 10 % and 50 %
@@ -205,7 +213,7 @@ def test_the_first_change_counts_the_samples_before_it_and_their_cost_is_the_sta
 
 def start_in_closed_loop(samples, seed):
     """Costs of θ as it starts, and whether a bound is violated, in a loop of this test's own."""
-    scenario = Scenario.load("paper")
+    scenario = toy_scenario()
     run = make_run("fixed", scenario, samples, seed=seed)
     controller = nmpc(scenario, run.starting_parameters(), "rti")
     costs, violating = [], []
@@ -234,5 +242,5 @@ def test_a_run_that_diverges_costs_infinitely_much_and_is_a_row_of_the_tables(tm
     table = pd.read_csv(tmp_path / "operation.csv").query("case == 'lost'").set_index("samples")
     assert np.isfinite(table.J[60])
     assert table.J[300] == np.inf
-    (run,) = results.of("lost", "paper").to_dict("records")
+    (run,) = results.runs_of("lost", "paper").to_dict("records")
     assert run["status"].startswith("diverged")

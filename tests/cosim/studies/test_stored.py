@@ -19,6 +19,10 @@ name = "mini"
 scenarios = ["paper"]
 evaluation = { seeds = 2, steps = 30 }
 check = true
+[[scenario]]
+extends = "paper"
+name = "paper"
+controller.horizon = 2
 [[case]]
 controller = ["naive", "tuned"]
 [[trajectory]]
@@ -55,9 +59,8 @@ def changed(mini, tmp_path):
     def change(text):
         folder = tmp_path / "results"
         shutil.copytree(mini, folder, ignore=shutil.ignore_patterns(".work"))
-        own = f'[[scenario]]\nextends = "paper"\nname = "paper"\n{text}\n'
         document = (folder / "mini.toml").read_text()
-        (folder / "mini.toml").write_text(document.replace("[[case]]", f"{own}[[case]]", 1))
+        (folder / "mini.toml").write_text(document.replace("[[case]]", f"{text}\n[[case]]", 1))
         return folder
 
     return change
@@ -140,7 +143,7 @@ def test_a_loose_qp_tolerance_fails_and_names_the_signal(changed, monkeypatch):
 
 @pytest.mark.slow
 def test_another_qp_solver_passes(changed):
-    code, output = check(changed('controller = { backend = "proxqp" }'))
+    code, output = check(changed('controller.backend = "proxqp"'))
     assert code == 0, output
 
 

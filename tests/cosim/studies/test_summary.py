@@ -79,7 +79,7 @@ FOUR = [[14.0, 10.0], [11.0, 11.0], [13.0, 19.0], [12.0, 14.0]]  # regrets .2, .
 
 
 def test_a_run_s_regret_is_that_of_its_mean_with_student_s_interval_over_noise():
-    runs = results({"a": FOUR}).of("a", "paper")
+    runs = results({"a": FOUR}).runs_of("a", "paper")
     assert runs.J.tolist() == [12.0, 11.0, 16.0, 13.0]
     assert runs.regret.tolist() == pytest.approx([0.2, 0.1, 0.6, 0.3])
     low, high = stats.t.interval(0.95, 1, loc=0.6, scale=stats.sem([0.3, 0.9]))

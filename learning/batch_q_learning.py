@@ -100,7 +100,7 @@ class BatchQLearning(ValueRule):
                 raise DivergenceError("TD errors are not finite")
             # Once, from the first batch: noise, widths and c_f.
             if self._variance == 0.0:
-                self._begin_filter(td_error)
+                td_error = self._begin_filter(td_error)
             fit, information = self._posterior(td_error, gradient * self._step.scale)
             fit = self._average_cost.absorb(fit)
             error_size = float(np.sqrt(np.mean(td_error**2)))
@@ -147,14 +147,23 @@ class BatchQLearning(ValueRule):
         present: Vector = (self.controller.theta - self._start) / self._step.scale
         return present
 
-    def _begin_filter(self, td_error: Vector) -> None:
-        """Take the noise, the widths and c_f from the samples of the first batch."""
+    def _begin_filter(self, td_error: Vector) -> Vector:
+        """Take the noise, the widths, c_f and the mean cost from the samples of the first batch.
+
+        Args:
+            td_error: δ of the batch, (K,).
+
+        Returns:
+            δ with that mean cost, (K,).
+        """
+        td_error = self._average_cost.begin(td_error + self._average_cost.mean_cost)
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
         states = self._buffer.column("s")
         errors = self._buffer.column("error")
         start = self._begin_with_prior(states, errors, self._variance**0.5)
         self.controller.theta = start.theta
         self._start = start.theta.copy()
+        return td_error
 
     def state_dict(self) -> State:
         """What `ValueRule` keeps, the open batch, and the posterior."""

@@ -219,7 +219,7 @@ class TrainingLoop:
             return self._applied, False
         exploring: Vector | None = None
         if not self.has_ended and getattr(self.algorithm, "explores", True):
-            exploring = self._strategy(solution.action, self.rng)
+            exploring = self._strategy(solution.action, self.rng, self.counts.number)
         wanted = solution.action if exploring is None else exploring
         # The QP keeps bounds to its tolerance, the actuator exactly.
         a = np.clip(wanted, self._lower, self._upper)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import (
     Configuration,
     Count,
+    ExplorationDecay,
     ExplorationProbability,
     ExplorationShare,
     NonNegative,
@@ -41,6 +43,7 @@ class ValueConfiguration(Configuration):
 
     exploration_probability: ExplorationProbability = 0.3
     exploration_share: ExplorationShare = 1 / 30
+    exploration_decay_after: ExplorationDecay = 1440
     discount: float | None = Field(
         None,
         gt=0,
@@ -172,6 +175,11 @@ class QLearningConfiguration(ValueConfiguration):
         # A mean cost that follows δ must be slower than the loop; the mean of ∇Q need not.
         return max(memory, 1), gradient_memory
 
+    @property
+    def full_exploration(self) -> float:
+        """As above; the rules td and fit, as printed, explore as long as they run."""
+        return super().full_exploration if self.rule == "kalman" else inf
+
     def without_part(self) -> Mapping[str, str]:
         """Hyperparameters of other rules than the chosen one."""
         names = ["step_size", "scaled"]
@@ -181,6 +189,7 @@ class QLearningConfiguration(ValueConfiguration):
             names += ["mean_cost_memory", "gradient_mean_memory"]
             for name in Configuration.model_fields:
                 names.remove(name)
+            names.append("exploration_decay_after")
         return dict.fromkeys(names, f"the rule {self.rule}")
 
 

@@ -63,6 +63,7 @@ def test_exact_parameters_alone_give_the_riccati_value_and_gain(linear_quadratic
 EXPLORATION = {
     "exploration_probability": 0.5,
     "exploration_deviation": (1.0,),
+    "exploration_decay_after": None,
 }
 LQ = {"measure_offset": True, "discount": DISCOUNT, **EXPLORATION}
 ONLINE = {"prior_width": 1.0, "prior_samples": 50, "step_every": 10, **LQ}

@@ -30,6 +30,11 @@ class BatchQLearningConfiguration(ValueConfiguration):
         description="samples of the first batch, which gives noise and widths; as the others if "
         "not given",
     )
+    intercept: bool = Field(
+        True,
+        description="at a discount of 1 δ and ∇Q lose their means over the batch, for the level of "
+        "Q means nothing; false: the mean cost is fitted with θ",
+    )
     relinearisations: Count = Field(2, description="replays and steps of θ per batch")
 
 
@@ -41,6 +46,7 @@ class BatchQLearning(ValueRule):
 
         min_d Σ (δ − ∇Qᵀ(d − d_now))²/r + (d − m)ᵀΛ(d − m),  then Λ ← Λ + GᵀG/r, m ← d
 
+    At γ = 1 both δ and ∇Q are those less their means over the batch: a fit with an intercept.
     This is done `relinearisations` times a batch, each at the θ of the last step: the iterated
     filter (Gauss–Newton on the posterior). The first batch also gives noise, widths and c_f.
     """
@@ -101,6 +107,8 @@ class BatchQLearning(ValueRule):
             # Once, from the first batch: noise, widths and c_f.
             if self._variance == 0.0:
                 td_error = self._begin_filter(td_error)
+            if settings.intercept:
+                td_error, gradient = self._average_cost.centre(td_error, gradient)
             fit, information = self._posterior(td_error, gradient * self._step.scale)
             fit = self._average_cost.absorb(fit)
             error_size = float(np.sqrt(np.mean(td_error**2)))

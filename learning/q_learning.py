@@ -552,13 +552,14 @@ class KalmanRegression:
 class AverageCost:
     """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
 
-    At γ = 1 the constant c_lambda cancels out of δ, and Q with any constant added is as good. So g
-    is found in one of two ways, and c_lambda stays in both:
+    At γ = 1 the constant c_lambda cancels out of δ, and Q with any constant added is as good. So
+    c_lambda stays, and g is found in one of three ways:
 
     - It is fitted with θ, in c_lambda's place.
     - It follows δ: each sample takes g ← g + δ/memory, differential Q-learning after Wan, Naik and
       Sutton (2021). The fit of θ is then one with an intercept that is forgotten: ∇Q loses its
       running mean, for without that the mean pays the level of δ into θ (docs/method.md).
+    - It is the intercept of a batch (`centre`).
 
     Args:
         discount: γ.
@@ -624,6 +625,22 @@ class AverageCost:
         self._gradient_mean += (gradient - self._gradient_mean) / window
         centred: Vector = gradient - self._gradient_mean
         return centred
+
+    def centre(self, td_errors: Vector, gradients: Matrix) -> tuple[Vector, Matrix]:
+        """Make a batch's fit one with an intercept at γ = 1, which g takes.
+
+        Args:
+            td_errors: δ, (K,).
+            gradients: ∇Q, (K, n_θ).
+
+        Returns:
+            Both less their means, in which c_lambda's entry vanishes; unchanged at γ < 1.
+        """
+        if self.discount != 1.0:
+            return td_errors, gradients
+        level = float(td_errors.mean())
+        self.mean_cost += level
+        return td_errors - level, gradients - gradients.mean(axis=0)
 
     def target(self, cost: Values, next_value: Values) -> Values:
         """Target of Q(s, a), of one sample or of several.

@@ -91,10 +91,11 @@ def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, r
     assert gain(controller) == pytest.approx(exact, abs=0.01)
 
 
-def test_the_mean_cost_is_found_beside_theta(linear_quadratic):
+def test_the_mean_cost_is_fitted_beside_theta(linear_quadratic):
     noise = 0.1
     exact = noise**2 * np.trace(linear_quadratic.riccati(1.0)[0])
-    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **BATCH | {"discount": 1.0})
+    settings = BATCH | {"discount": 1.0, "intercept": False}
+    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **settings)
     assert algorithm._average_cost.mean_cost == pytest.approx(exact, rel=0.2)
 
 
@@ -102,6 +103,7 @@ MEAN_COST = [
     (QLearning, {"mean_cost_memory": 5.0, **ONLINE, "discount": 1.0}),
     (QLearning, {"mean_cost_memory": 0.0, **ONLINE, "discount": 1.0}),
     (BatchQLearning, BATCH | {"discount": 1.0}),
+    (BatchQLearning, BATCH | {"discount": 1.0, "intercept": False}),
     (ActorCritic, {"batch_size": 100, "exploration_deviation": (1.0,)}),
 ]
 

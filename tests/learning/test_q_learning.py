@@ -142,6 +142,18 @@ def test_a_level_of_the_td_error_is_not_paid_into_theta(rng):
     assert np.abs(learned[0] - slopes).max() > 0.5
 
 
+def test_a_batch_without_its_means_is_fitted_with_an_intercept(rng):
+    gradient = rng.normal([2.0, -0.5, 1.0], [1.0, 1.0, 0.0], size=(50, 3))
+    errors = 3.0 + gradient @ [0.3, -0.2, 0.0] + rng.normal(size=50)
+    average_cost = AverageCost(1.0, 2, 1.0, 100.0)
+    centred, slopes = average_cost.centre(errors, gradient)
+    with_intercept = np.linalg.lstsq(gradient, errors)[0]
+    assert np.linalg.lstsq(slopes[:, :2], centred)[0] == pytest.approx(with_intercept[:2])
+    assert average_cost.mean_cost == pytest.approx(100.0 + errors.mean())
+    discounted = AverageCost(0.9, 2, 1.0, 100.0).centre(errors, gradient)
+    assert discounted[0] is errors and discounted[1] is gradient
+
+
 def test_the_first_samples_give_the_mean_cost_and_what_is_left_of_their_td_errors():
     levels = np.array([6010.0, 6020.0, 6060.0])
     average_cost = AverageCost(1.0, 1, 10.0, 0.0)

@@ -247,16 +247,14 @@ def _in_episodes(
     run: TrainingRun, _: Sequence[int], folder: Path
 ) -> tuple[str, str, dict[str, Any]]:
     """Log, θ and facts of a training as `cosim train` does it, its checkpoint in a folder."""
-    from learning.log import COLUMNS, LogRow, to_csv  # noqa: PLC0415
+    from learning.log import to_csv  # noqa: PLC0415
     from learning.training import run_training  # noqa: PLC0415
 
     result = run_training(run, folder, resume=(folder / CHECKPOINT).is_file())
-    samples = int(result.rows[-1]["samples"]) if result.rows else 0
-    # The log of a study starts with θ at the start, from which its increments are counted.
-    start = dict.fromkeys(result.rows[0] if result.rows else COLUMNS, float("nan"))
-    rows = [LogRow(start | {"samples": 0.0}, result.start), *result.rows]
+    samples = int(result.rows[-1]["samples"])
     about = {"status": result.status, "samples": samples, "plant_samples": result.plant_samples}
-    return to_csv(rows), result.parameters.to_toml(), about
+    # A study reports what the rule learned, be it worse than the start.
+    return to_csv(result.rows), result.learned.to_toml(), about
 
 
 # The folder of a run

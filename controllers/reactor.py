@@ -30,7 +30,10 @@ def model() -> Model:
         name="reactor",
         states=(Quantity("cA", "mol/L", 0.5), Quantity("T", "K", 345.0)),
         actions=(Quantity("q", "L/min", 100.0), Quantity("Tc", "K", 320.0)),
-        disturbances=(Quantity("cAf", "mol/L", 1.0), Quantity("Tf", "K", 350.0)),
+        disturbances=(
+            Quantity("cAf", "mol/L", 1.0),
+            Quantity("Tf", "K", 350.0, magnitude=50.0),
+        ),
         parameters=(
             Quantity("V", "L", 100.0),
             Quantity("k0", "1/min", 9.2e4),

@@ -21,6 +21,7 @@ from cosim.core.scenario import Scenario
 from cosim.core.simulation import recover
 from learning.algorithm import Transition
 from learning.back_off import BackOffConfiguration, BackOffSearch
+from learning.empirical_model import displaced
 from learning.prediction_errors import OneStepModel
 
 Sample = Callable[[RtiNmpc, Array, np.random.Generator], Transition]
@@ -53,7 +54,7 @@ def back_off(
     Args:
         start: θ with no bound backed off.
         scenario: bounds, penalty and nominal model.
-        deviation: guessed standard deviation of each disturbance, as a share of its nominal value;
+        deviation: guessed standard deviation of each disturbance, as a share of its magnitude;
             they are normal about this, new in each sample.
         samples: of the model that the search takes.
     """
@@ -99,7 +100,7 @@ def add_reserve(
     Args:
         start: θ with the active bounds backed off.
         scenario: bounds, penalty and nominal model.
-        deviation: guessed standard deviation of each disturbance, as a share of its nominal value.
+        deviation: guessed standard deviation of each disturbance, as a share of its magnitude.
         reserve: the back-off, in standard deviations of the one-step error.
         samples: of the simulation.
     """
@@ -143,6 +144,7 @@ def _simulation(scenario: Scenario, deviation: float) -> Sample:
     results = {"y": next_x, "l": ca.SX(model.economic_cost(x, u, d, p))}
     plant = StackedFunction("f", {"x": x, "u": u, "d": d}, results)
     nominal = model.nominal_disturbance
+    magnitudes = model.disturbance_magnitudes
 
     def sample(
         controller: RtiNmpc,
@@ -154,8 +156,9 @@ def _simulation(scenario: Scenario, deviation: float) -> Sample:
         a = scenario.saturate(solution.action)
         plant.inputs["x"][:] = s
         plant.inputs["u"][:] = a
-        # In proportion to their values: no scenario says more on the first day.
-        plant.inputs["d"][:] = nominal * (1.0 + deviation * noise.standard_normal(nominal.size))
+        # In proportion to their magnitudes: nobody knows more on the first day.
+        share = deviation * noise.standard_normal(nominal.size)
+        plant.inputs["d"][:] = displaced(nominal, magnitudes, share)
         plant()
         next_s = plant.part("y").copy()
         stage_cost = float(plant.part("l")[0])

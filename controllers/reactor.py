@@ -32,7 +32,8 @@ def model() -> Model:
         actions=(Quantity("q", "L/min", 100.0), Quantity("Tc", "K", 320.0)),
         disturbances=(
             Quantity("cAf", "mol/L", 1.0),
-            Quantity("Tf", "K", 350.0, magnitude=50.0),
+            # Counted from 0 °C, as the evaporator's temperatures are.
+            Quantity("Tf", "K", 350.0, magnitude=76.85),
         ),
         parameters=(
             Quantity("V", "L", 100.0),

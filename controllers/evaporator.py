@@ -11,8 +11,8 @@ ACTIONS = (Quantity("P100", "kPa", 191.71322), Quantity("F200", "kg/min", 215.88
 DISTURBANCES = (
     Quantity("X1", "%", 5.0),
     Quantity("F1", "kg/min", 10.0),
-    Quantity("T1", "degC", 40.0),
-    Quantity("T200", "degC", 25.0),
+    Quantity("T1", "degC", 40.0, magnitude=40.0),
+    Quantity("T200", "degC", 25.0, magnitude=25.0),
 )
 PARAMETERS = (
     Quantity("a", "degC/kPa", 0.5616),

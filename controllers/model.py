@@ -18,14 +18,27 @@ KINDS = ("states", "actions", "disturbances", "parameters")
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 
+TEMPERATURES = ("K", "degC", "degF", "°C", "°F")
+"""Units whose zero is not that of the quantity's variation."""
+
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity: its name, unit and nominal value."""
+    """A quantity of a model.
+
+    Attributes:
+        name: of the quantity.
+        unit: of its values.
+        nominal: its nominal value.
+        magnitude: of a disturbance, the size of which its guessed deviation is 10 %; the nominal
+            value's if not given. A temperature needs one: the zero of its unit says nothing of
+            its size.
+    """
 
     name: str
     unit: str
     nominal: float = 0.0
+    magnitude: float | None = None
 
 
 @dataclass(frozen=True)
@@ -111,12 +124,38 @@ class Model:
                     f"model '{self.name}': the nominal value of {quantity.name} must be a finite "
                     f"number, not {quantity.nominal!r}"
                 )
+            magnitude = quantity.magnitude
+            positive = isinstance(magnitude, int | float) and 0 < magnitude < float("inf")
+            if magnitude is not None and not positive:
+                raise ModelError(
+                    f"model '{self.name}': the magnitude of {quantity.name} must be a positive "
+                    f"number, not {magnitude!r}"
+                )
         return tuple(given)
 
     @property
     def nominal_disturbance(self) -> NDArray[np.float64]:
         """Nominal disturbance, shape (n_d,)."""
         return np.array([quantity.nominal for quantity in self.disturbances])
+
+    @property
+    def disturbance_magnitudes(self) -> NDArray[np.float64]:
+        """Magnitude of each disturbance, shape (n_d,), on which no unit decides.
+
+        Raises:
+            ModelError: a temperature has none.
+        """
+        magnitudes = []
+        for quantity in self.disturbances:
+            magnitude = quantity.magnitude
+            if magnitude is None and quantity.unit in TEMPERATURES:
+                raise ModelError(
+                    f"model '{self.name}': the disturbance {quantity.name} is a temperature in "
+                    f"{quantity.unit}, whose nominal value says nothing of its size; add "
+                    "magnitude=… to its Quantity, ten times the deviation that you expect"
+                )
+            magnitudes.append(abs(quantity.nominal) if magnitude is None else magnitude)
+        return np.array(magnitudes)
 
     @property
     def nominal_parameters(self) -> NDArray[np.float64]:

@@ -30,7 +30,11 @@ def model() -> Model:
         name="reactor",
         states=(Quantity("cA", "mol/L", 0.5), Quantity("T", "K", 345.0)),
         actions=(Quantity("q", "L/min", 100.0), Quantity("Tc", "K", 320.0)),
-        disturbances=(Quantity("cAf", "mol/L", 1.0), Quantity("Tf", "K", 350.0)),
+        disturbances=(
+            Quantity("cAf", "mol/L", 1.0),
+            # Counted from 0 °C, as the evaporator's temperatures are.
+            Quantity("Tf", "K", 350.0, magnitude=76.85),
+        ),
         parameters=(
             Quantity("V", "L", 100.0),
             Quantity("k0", "1/min", 9.2e4),

@@ -21,6 +21,7 @@ from cosim.core.protocols import Array, Step
 from cosim.core.scenario import Scenario
 from learning.algorithm import Transition
 from learning.back_off import BackOffConfiguration, BackOffSearch
+from learning.empirical_model import displaced
 from learning.prediction_errors import OneStepModel
 
 _searched: dict[tuple[str, str, float, int], Parameters] = {}
@@ -52,7 +53,7 @@ def back_off(
     Args:
         start: θ with no bound backed off.
         scenario: bounds, penalty and nominal model.
-        deviation: guessed standard deviation of each disturbance, as a share of its nominal value;
+        deviation: guessed standard deviation of each disturbance, as a share of its magnitude;
             they are normal about this, new in each sample.
         samples: of the model that the search takes.
     """
@@ -92,7 +93,7 @@ def add_reserve(
     Args:
         start: θ with the active bounds backed off.
         scenario: bounds, penalty and nominal model.
-        deviation: guessed standard deviation of each disturbance, as a share of its nominal value.
+        deviation: guessed standard deviation of each disturbance, as a share of its magnitude.
         reserve: the back-off, in standard deviations of the one-step error.
         samples: of the simulation.
     """
@@ -145,6 +146,7 @@ class GuessedPlant:
         self._deviation = deviation
         self._function = StackedFunction("f", {"x": x, "u": u, "d": d}, results)
         self._nominal = model.nominal_disturbance
+        self._magnitudes = model.disturbance_magnitudes
         self.reset(0)
 
     def reset(self, seed: int) -> Array:
@@ -157,8 +159,9 @@ class GuessedPlant:
         """Hold the action a (m,) for one sampling time."""
         s = self._s
         function = self._function
-        noise = self._rng.standard_normal(self._nominal.size)
-        d = self._nominal * (1.0 + self._deviation * noise)
+        # In proportion to their magnitudes: nobody knows more on the first day.
+        share = self._deviation * self._rng.standard_normal(self._nominal.size)
+        d = np.array(displaced(self._nominal, self._magnitudes, share))
         function.inputs["x"][:] = s
         function.inputs["u"][:] = a
         function.inputs["d"][:] = d

@@ -30,6 +30,11 @@ class BatchQLearningConfiguration(ValueConfiguration):
         description="samples of the first batch, which gives noise and widths; as the others if "
         "not given",
     )
+    intercept: bool = Field(
+        True,
+        description="at a discount of 1 δ and ∇Q lose their means over the batch, for the level of "
+        "Q means nothing; false: the mean cost is fitted with θ",
+    )
     relinearisations: Count = Field(2, description="replays and steps of θ per batch")
 
 
@@ -41,6 +46,7 @@ class BatchQLearning(ValueRule):
 
         min_d Σ (δ − ∇Qᵀ(d − d_now))²/r + (d − m)ᵀΛ(d − m),  then Λ ← Λ + GᵀG/r, m ← d
 
+    At γ = 1 both δ and ∇Q are those less their means over the batch: a fit with an intercept.
     This is done `relinearisations` times a batch, each at the θ of the last step: the iterated
     filter (Gauss–Newton on the posterior). The first batch also gives noise, widths and c_f.
     """
@@ -100,7 +106,9 @@ class BatchQLearning(ValueRule):
                 raise DivergenceError("TD errors are not finite")
             # Once, from the first batch: noise, widths and c_f.
             if self._variance == 0.0:
-                self._begin_filter(td_error)
+                td_error = self._begin_filter(td_error)
+            if settings.intercept:
+                td_error, gradient = self._average_cost.centre(td_error, gradient)
             fit, information = self._posterior(td_error, gradient * self._step.scale)
             fit = self._average_cost.absorb(fit)
             error_size = float(np.sqrt(np.mean(td_error**2)))
@@ -147,14 +155,23 @@ class BatchQLearning(ValueRule):
         present: Vector = (self.controller.theta - self._start) / self._step.scale
         return present
 
-    def _begin_filter(self, td_error: Vector) -> None:
-        """Take the noise, the widths and c_f from the samples of the first batch."""
+    def _begin_filter(self, td_error: Vector) -> Vector:
+        """Take the noise, the widths, c_f and the mean cost from the samples of the first batch.
+
+        Args:
+            td_error: δ of the batch, (K,).
+
+        Returns:
+            δ with that mean cost, (K,).
+        """
+        td_error = self._average_cost.begin(td_error + self._average_cost.mean_cost)
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
         states = self._buffer.column("s")
         errors = self._buffer.column("error")
         start = self._begin_with_prior(states, errors, self._variance**0.5)
         self.controller.theta = start.theta
         self._start = start.theta.copy()
+        return td_error
 
     def state_dict(self) -> State:
         """What `ValueRule` keeps, the open batch, and the posterior."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping
+from math import inf
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -19,7 +20,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
-# The rules differ in these three, so they have other defaults in each.
+# The rules differ in these four, so they have other defaults in each.
 ModelParameters = Annotated[
     tuple[str, ...],
     Field(description='parameters of the controller\'s model that θ has; all of them by ["all"]'),
@@ -27,6 +28,13 @@ ModelParameters = Annotated[
 ExplorationProbability = Annotated[Share, Field(description="share of samples that explore")]
 ExplorationShare = Annotated[
     Positive, Field(description="standard deviation of e as a share of the input's range")
+]
+ExplorationDecay = Annotated[
+    Count | None,
+    Field(
+        description="samples T after which the share that explores falls, by T/k at the k-th; it "
+        "stays if not given",
+    ),
 ]
 
 
@@ -65,10 +73,11 @@ class Configuration(BaseModel):
     exploration: Literal["additive", "literal", "none"] = Field(
         "additive",
         description="a = sat(π+e), a = sat(e), or always a = π; a scenario's table [exploration] "
-        "replaces the defaults of all four exploration settings",
+        "replaces the defaults of all exploration settings",
     )
     exploration_probability: ExplorationProbability = 1.0
     exploration_share: ExplorationShare = 1 / 60
+    exploration_decay_after: ExplorationDecay = None
     exploration_deviation: tuple[NonNegative, ...] | None = Field(
         None,
         description="in place of the share: σ of e in the units of u, one or one per action",
@@ -103,11 +112,17 @@ class Configuration(BaseModel):
             stated["exploration"] = table.kind
             stated["exploration_probability"] = table.probability
             stated["exploration_deviation"] = table.standard_deviation or (0.0,)
+            stated["exploration_decay_after"] = None
         if scenario.controller.value_offset is not None:
             stated["value_offset"] = scenario.controller.value_offset
         for name in self.model_fields_set:
             stated.pop(name, None)
         return self.model_copy(update=stated)
+
+    @property
+    def full_exploration(self) -> float:
+        """Samples after which the share that explores falls."""
+        return self.exploration_decay_after or inf
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """Names of the model parameters that θ has."""

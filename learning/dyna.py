@@ -12,7 +12,7 @@ from cosim.core.protocols import Array, Step
 from cosim.core.scenario import Scenario
 from learning.algorithm import Transition, Update
 from learning.checkpoint import State, part_of, prefixed
-from learning.configuration import Count
+from learning.configuration import Count, ExplorationDecay
 from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
 from learning.loop import PlantInOperation, TrainingLoop
 from learning.plant_data import PlantData
@@ -25,6 +25,7 @@ class DynaConfiguration(QLearningConfiguration, EmpiricalModelConfiguration):
 
     model_samples: int = Field(4, ge=0, description="samples of the model for each of the plant")
     interval: Count = Field(120, description="least samples of the plant between the model's fits")
+    exploration_decay_after: ExplorationDecay = None
     exploration_samples: Count = Field(
         480,
         description="samples of the plant that explore after the start and after a change of it; "

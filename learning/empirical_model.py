@@ -1,11 +1,12 @@
 """A model of a plant from its own operation: what the controller's nominal model lacks.
 
 (s₊, ℓ) = y(s, a; c) + W (1, s, a) + h(s, a) r. y is the nominal model with its economic cost, whose
-parameters and nominal disturbances are c times their value larger. h is the size of the error that
-disturbances in proportion to their values would make. c and W are estimated from transitions by
-Bayesian generalised least squares, in Gauss-Newton steps since y is not linear in c; the width of
-the prior of W's slopes is the one of greatest evidence (MacKay 1992). The residuals r are kept and
-drawn anew. The model knows no parameter of the plant and no law of its disturbances.
+parameters are c times their value larger, and its disturbances c times their magnitude. h is the
+size of the error that disturbances in proportion to their magnitudes would make. c and W are
+estimated from transitions by Bayesian generalised least squares, in Gauss-Newton steps since y is
+not linear in c; the width of the prior of W's slopes is the one of greatest evidence (MacKay 1992).
+The residuals r are kept and drawn anew. The model knows no parameter of the plant and no law of its
+disturbances.
 """
 
 from __future__ import annotations
@@ -96,6 +97,27 @@ class EmpiricalModelConfiguration(Configuration):
     )
 
 
+def displaced(nominal: Array, magnitudes: Array, share: Any) -> list[Any]:
+    """Values a share of their magnitude away from the nominal ones.
+
+    Args:
+        nominal: values, (n,).
+        magnitudes: (n,).
+        share: numbers or CasADi expressions, (n,).
+
+    Returns:
+        nominal + magnitude · share of each.
+    """
+    values = []
+    for i, (value, magnitude) in enumerate(zip(nominal, magnitudes, strict=True)):
+        if value == 0:
+            values.append(magnitude * share[i])
+        else:
+            # A factor of one where the magnitude is the value's own.
+            values.append(value * (1 + magnitude / value * share[i]))
+    return values
+
+
 class Features:
     """The nominal model as a function of its parameters' errors c (p,), for K = n + 1 outputs.
 
@@ -117,13 +139,16 @@ class Features:
         x, u, d, p = model.symbols()
         step = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
         outputs = ca.vertcat(step, economic_cost(model)(x, u, d, p))
-        # Parameters and nominal disturbances alike are c times their value larger.
-        nominal = ca.DM([*model.nominal_parameters, *model.nominal_disturbance])
-        c = ca.SX.sym("c", nominal.numel())
-        (y,) = ca.substitute([outputs], [ca.vertcat(p, d)], [nominal * (1 + c)])
+        # Parameters are c times their value larger, disturbances c times their magnitude.
+        c = ca.SX.sym("c", p.numel() + d.numel())
+        disturbed = displaced(
+            model.nominal_disturbance, model.disturbance_magnitudes, c[p.numel() :]
+        )
+        at_errors = ca.vertcat(ca.DM(model.nominal_parameters) * (1 + c[: p.numel()]), *disturbed)
+        (y,) = ca.substitute([outputs], [ca.vertcat(p, d)], [at_errors])
         G = ca.jacobian(y, c)
 
-        # The size of the error that disturbances in proportion to their values would make.
+        # The size of the error that disturbances in proportion to their magnitudes would make.
         by_disturbance = ca.substitute(G[:, p.numel() :], c, ca.DM.zeros(c.shape))
         size = ca.sqrt(ca.sum2(by_disturbance**2))
         size_at = ca.Function("size", [x, u], [size])

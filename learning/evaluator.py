@@ -16,6 +16,7 @@ from cosim.core.simulation import indicators_of
 from cosim.core.statistics import gap_closed, regret
 from learning.log import METRICS
 from learning.training_run import HELD_OUT, TrainingRun
+from learning.verdict import cost_difference
 
 
 class Evaluator:
@@ -28,7 +29,7 @@ class Evaluator:
         optimum: its J on the same seeds is J*; None: unknown.
 
     Attributes:
-        start_J: J of the start.
+        start: what `evaluate` says of the start.
         baselines: J of naive and, where it is known, optimal.
         limit: greedy J above which a run has diverged.
     """
@@ -43,36 +44,47 @@ class Evaluator:
         self._run = run
         self._plant = plant
         self._controller = nmpc(run.scenario, start, run.controller)
-        # Gap closed is measured from naive to optimal, on the same noise.
         naive = Parameters.naive(Problem.from_scenario(run.scenario))
-        self._naive_costs = self._costs(nmpc(run.scenario, naive, run.controller))["J"]
+        naive_costs = self._costs(nmpc(run.scenario, naive, run.controller))["J"]
+        self.baselines = {"naive": float(naive_costs.mean())}
         self._optimal_costs = np.full(run.evaluation_seeds, np.nan)
-        self.start_J = float(self._costs(self._controller)["J"].mean())
-        self.baselines = {"naive": float(self._naive_costs.mean())}
         if optimum is not None:
             self._optimal_costs = self._costs(optimum)["J"]
             self.baselines["optimal"] = float(self._optimal_costs.mean())
+        # All that a training is compared with meets the same noise.
+        start_costs = self._costs(self._controller)
+        self._start_costs = start_costs["J"]
+        self.start = self._metrics(start_costs)
         # A cost may be negative (a profit): the margin is a share of its magnitude.
-        worst = max(self.baselines["naive"], self.start_J)
+        worst = max(self.baselines["naive"], self.start["J"])
         self.limit = worst + (run.divergence - 1) * abs(worst)
 
     def evaluate(self, theta: Array) -> dict[str, Any]:
         """The greedy policy at θ (n_θ,).
 
         Returns:
-            Means of `METRICS`, `failures` a sum; `regret`, its 95 % `regret_interval` over the
-            runs, and `gap_closed`, None where unknown.
+            Means of `METRICS`, `failures` a sum; `difference` of J from the start's and its
+            `difference_interval`; `regret`, its `regret_interval`, and `gap_closed`, the share of
+            the start's regret that is gone, None where unknown. Intervals are of 95 %, over the
+            seeds.
         """
         self._controller.theta = theta
-        costs = self._costs(self._controller)
+        return self._metrics(self._costs(self._controller))
+
+    def _metrics(self, costs: dict[str, Array]) -> dict[str, Any]:
+        """What `evaluate` returns of the indicators of the seeds, (K,) each."""
         metrics: dict[str, Any] = {name: float(costs[name].mean()) for name in METRICS}
         metrics["failures"] = int(costs["failures"].sum())
         excess = regret(costs["J"], self._optimal_costs)
-        gap = gap_closed(costs["J"], self._naive_costs, self._optimal_costs)
+        gap = gap_closed(costs["J"], self._start_costs, self._optimal_costs)
+        difference = cost_difference(costs["J"], self._start_costs)
+        metrics["difference"] = difference.value
+        metrics["difference_interval"] = difference.interval
         known = isfinite(excess.value)
         metrics["regret"] = excess.value if known else None
         metrics["regret_interval"] = excess.interval
-        metrics["gap_closed"] = gap.value if known else None
+        # A start that is the optimum leaves no gap.
+        metrics["gap_closed"] = gap.value if isfinite(gap.value) else None
         return metrics
 
     def _costs(self, policy: Controller) -> dict[str, Array]:

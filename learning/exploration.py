@@ -14,10 +14,13 @@ from learning.errors import ConfigurationError
 class Strategy:
     """Draws the actions that explore: a = sat(c + e), e ~ N(0, diag σ²), on a share of the samples.
 
-    The centre c is the policy's action (`additive`) or zero (`literal`, as the paper prints it).
+    After the first T samples the k-th explores with the share's probability times T/k. So the cost
+    of exploration goes to zero, while each action is still tried without end (the condition GLIE of
+    Singh, Jaakkola, Littman and Szepesvári, Machine Learning 38, 2000). The centre c is the
+    policy's action (`additive`) or zero (`literal`, as the paper prints it).
 
     Attributes:
-        probability: share of the samples that explore.
+        probability: share of the samples that explore, before it falls.
         deviation: σ, (m,) or (1,), in the actions' units.
         lower, upper: bounds (m,) at which the loop saturates.
 
@@ -38,15 +41,31 @@ class Strategy:
                 f"each of the {self.lower.size} actions"
             )
         self.probability = configuration.exploration_probability
+        self._full_samples = configuration.full_exploration
         if self.kind == "none":
             self.probability = 0.0
 
-    def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
-        """Exploring action (m,) in place of the policy's `action`; None: greedy."""
+    def __call__(
+        self,
+        action: Vector,
+        rng: np.random.Generator,
+        number: int = 0,
+    ) -> Vector | None:
+        """The action that explores, if one does.
+
+        Args:
+            action: the policy's, (m,).
+            rng: draws in every sample.
+            number: of the sample, from 0.
+
+        Returns:
+            The exploring action, (m,), or None: greedy.
+        """
         # Draw in every sample, so that runs of any probability stay paired.
         draw = rng.random()
         e = rng.standard_normal(self.lower.size)
-        if draw >= self.probability:
+        decay = min(1.0, self._full_samples / (number + 1))
+        if draw >= self.probability * decay:
             return None
         exploring: Vector = self._centre(action) + self.deviation * e
         return exploring

@@ -216,7 +216,7 @@ class TrainingLoop:
         # After a failed solve there is no action to explore about.
         if solution is None or not explores:
             return loop.action(), False
-        wanted = self._strategy(solution.action, self.rng)
+        wanted = self._strategy(solution.action, self.rng, self.counts.number)
         if wanted is None:
             return loop.action(), False
         a = loop.saturate(wanted)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import (
     Configuration,
     Count,
+    ExplorationDecay,
     ExplorationProbability,
     ExplorationShare,
     NonNegative,
@@ -32,12 +34,16 @@ from learning.step import ConstrainedStep, Fit, td_fit, td_step
 
 Values = TypeVar("Values", float, NDArray[np.float64])
 
+LEAST_MEAN_SAMPLES = 10
+"""Samples of the shortest mean of ∇Q: over M samples it takes 1/M of what each of them teaches."""
+
 
 class ValueConfiguration(Configuration):
     """Hyperparameters that Q-learning has online and in batches."""
 
     exploration_probability: ExplorationProbability = 0.3
     exploration_share: ExplorationShare = 1 / 30
+    exploration_decay_after: ExplorationDecay = 1440
     discount: float | None = Field(
         None,
         gt=0,
@@ -99,12 +105,20 @@ class ValueConfiguration(Configuration):
         description="prior deviations by which a step may move an entry of θ; 0: no limit",
     )
 
-    def criterion(self, scenario: Scenario) -> tuple[float, float]:
-        """Discount of the TD error, and time constants over which the mean cost follows δ.
+    def td_discount(self, scenario: Scenario) -> float:
+        """Discount γ of the TD error; 1 is the mean cost."""
+        return self.discount or 1.0
 
-        With 0 the mean cost is fitted with θ.
+    def mean_cost_samples(self, time_constant: float) -> tuple[int, int]:
+        """Samples over which the mean cost follows δ, and of the mean that ∇Q loses.
+
+        Args:
+            time_constant: the slowest of the nominal model, in samples.
+
+        Returns:
+            Both numbers; zero where the mean cost is fitted, and where ∇Q loses no mean.
         """
-        return self.discount or 1.0, 0.0
+        return 0, 0
 
 
 class QLearningConfiguration(ValueConfiguration):
@@ -128,6 +142,12 @@ class QLearningConfiguration(ValueConfiguration):
         description="time over which the mean cost follows δ, in slowest time constants of the "
         "nominal model; 0: the mean cost is fitted with θ",
     )
+    gradient_mean_memory: NonNegative = Field(
+        0.65,
+        description="where the mean cost follows δ, the running mean of ∇Q over this time, in "
+        "slowest time constants of the nominal model and ten samples at least, is taken off ∇Q, "
+        "for the level of Q means nothing; 0: it stays in",
+    )
     parameter_drift: NonNegative = Field(
         0.0,
         description="variance that each sample adds to θ, in units of the prior's, so that "
@@ -139,20 +159,37 @@ class QLearningConfiguration(ValueConfiguration):
         description="rules td and fit: step in coordinates θ/scale, else in θ itself",
     )
 
-    def criterion(self, scenario: Scenario) -> tuple[float, float]:
-        """As without this; δ of the rules td and fit has the scenario's discount."""
-        if self.rule != "kalman":
-            return self.discount or scenario.discount, 0.0
-        return self.discount or 1.0, self.mean_cost_memory
+    def td_discount(self, scenario: Scenario) -> float:
+        """Discount γ of the TD error; that of the rules td and fit is the scenario's."""
+        by_default = 1.0 if self.rule == "kalman" else scenario.discount
+        return self.discount or by_default
+
+    def mean_cost_samples(self, time_constant: float) -> tuple[int, int]:
+        """As above, by `mean_cost_memory` and `gradient_mean_memory`."""
+        memory = round(self.mean_cost_memory * time_constant)
+        gradient_memory = round(self.gradient_mean_memory * time_constant)
+        if self.gradient_mean_memory:
+            gradient_memory = max(gradient_memory, LEAST_MEAN_SAMPLES)
+        if self.rule != "kalman" or not self.mean_cost_memory:
+            return 0, 0
+        # A mean cost that follows δ must be slower than the loop; the mean of ∇Q need not.
+        return max(memory, 1), gradient_memory
+
+    @property
+    def full_exploration(self) -> float:
+        """As above; the rules td and fit, as printed, explore as long as they run."""
+        return super().full_exploration if self.rule == "kalman" else inf
 
     def without_part(self) -> Mapping[str, str]:
         """Hyperparameters of other rules than the chosen one."""
         names = ["step_size", "scaled"]
         if self.rule != "kalman":
             names = [name for name in ValueConfiguration.model_fields if name != "discount"]
-            names += ["prior_samples", "step_every", "parameter_drift", "mean_cost_memory"]
+            names += ["prior_samples", "step_every", "parameter_drift"]
+            names += ["mean_cost_memory", "gradient_mean_memory"]
             for name in Configuration.model_fields:
                 names.remove(name)
+            names.append("exploration_decay_after")
         return dict.fromkeys(names, f"the rule {self.rule}")
 
 
@@ -229,24 +266,21 @@ class ValueRule(Algorithm):
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
         self._errors = PredictionErrors(self.scenario, self.configuration.prediction_errors)
+        memory, gradient_memory = self.configuration.mean_cost_samples(self._model.slowest)
+        self._average_cost = AverageCost(
+            discount=self.configuration.td_discount(self.scenario),
+            position=self.controller.parameters.blocks.slices["c_lambda"].start,
+            scale=1.0,
+            start=self.scenario.controller.reference_cost,
+            memory=memory,
+            gradient_memory=gradient_memory,
+        )
         self._set_coordinates(np.ones(self.controller.theta.size))
 
     def _set_coordinates(self, scale: Vector) -> None:
-        """Begin anew with this scale of each entry of θ in the steps' coordinates, (n_θ,)."""
+        """Take this scale of each entry of θ, (n_θ,), as the steps' coordinates from here on."""
         self._step = ConstrainedStep(self.controller, self.configuration, scale)
-        # A mean cost that follows δ must be slower than the loop.
-        discount, time_constants = self.configuration.criterion(self.scenario)
-        position = self._step.blocks.slices["c_lambda"].start
-        memory = 0
-        if time_constants:
-            memory = round(time_constants * self._model.slowest)
-        self._average_cost = AverageCost(
-            discount=discount,
-            position=position,
-            scale=float(scale[position]),
-            start=self.scenario.controller.reference_cost,
-            memory=memory,
-        )
+        self._average_cost.set_scale(scale)
 
     def _begin_with_prior(
         self,
@@ -334,20 +368,22 @@ class QLearning(ValueRule):
         solution = transition.q_solution
         target = self._average_cost.target(transition.cost, next_value)
         td_error = target - solution.value
+        mean_cost = self._average_cost.mean_cost
         self._average_cost.follow(td_error)
+        gradient = self._average_cost.without_level(solution.value_gradient)
 
         self._count += 1
         # In the warm-up no θ moves: its samples say how large noise and errors are.
         left = self.configuration.prior_samples - self._count
         if left >= 0:
-            row = [*transition.s.tolist(), *error.tolist(), td_error]
+            # The mean cost is not known yet: δ is kept with it.
+            level = td_error + mean_cost
+            row = [*transition.s.tolist(), *error.tolist(), level]
             self._warm_up.append(row)
             return self._begin_regression() if left == 0 else None
 
         # From here on each sample is a measurement of the step.
-        gradient = solution.value_gradient * self._step.scale
-        gradient = self._average_cost.without_level(gradient)
-        innovation = self._regression.update(td_error, gradient)
+        innovation = self._regression.update(td_error, gradient * self._step.scale)
         self._sum_of_squares += innovation * innovation
         if self._count % self.configuration.step_every:
             return None
@@ -363,7 +399,7 @@ class QLearning(ValueRule):
         self._warm_up.clear()
         n = self._model.n_states
         # The start's TD errors are the noise that the filter expects.
-        td_errors = rows[:, -1]
+        td_errors = self._average_cost.begin(rows[:, -1])
         variance = float(np.mean(td_errors**2))
         if not np.isfinite(variance):
             raise DivergenceError("TD errors are not finite")
@@ -395,10 +431,9 @@ class QLearning(ValueRule):
         return self._step.apply(self._average_cost.absorb(fit), abs(td_error))
 
     def begin_anew(self) -> None:
-        """Forget noise, widths and mean cost; the next samples are a warm-up at the present θ."""
+        """Forget noise and widths; the next samples are a warm-up at the present θ."""
         self._count = 0
         self._warm_up = []
-        self._average_cost.mean_cost = self.scenario.controller.reference_cost
 
     def state_dict(self) -> State:
         """What `ValueRule` keeps, the warm-up's rows, and the regression."""
@@ -517,9 +552,14 @@ class KalmanRegression:
 class AverageCost:
     """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
 
-    At γ = 1 the constant c_lambda cancels out of δ: its step goes to g, and c_lambda stays. With a
-    `memory` g is no part of the fit, and each sample takes g ← g + δ/memory: differential
-    Q-learning after Wan, Naik and Sutton (2021).
+    At γ = 1 the constant c_lambda cancels out of δ, and Q with any constant added is as good. So
+    c_lambda stays, and g is found in one of three ways:
+
+    - It is fitted with θ, in c_lambda's place.
+    - It follows δ: each sample takes g ← g + δ/memory, differential Q-learning after Wan, Naik and
+      Sutton (2021). The fit of θ is then one with an intercept that is forgotten: ∇Q loses its
+      running mean, for without that the mean pays the level of δ into θ (docs/method.md).
+    - It is the intercept of a batch (`centre`).
 
     Args:
         discount: γ.
@@ -527,6 +567,7 @@ class AverageCost:
         scale: of c_lambda in the fit's coordinates.
         start: first guess of g.
         memory: samples over which g follows δ; 0: g is fitted with θ.
+        gradient_memory: samples of the running mean that ∇Q loses; 0: it loses none.
     """
 
     def __init__(
@@ -536,12 +577,29 @@ class AverageCost:
         scale: float,
         start: float,
         memory: int = 0,
+        gradient_memory: int = 0,
     ) -> None:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
         self._position = position
         self._scale = scale
         self._memory = memory if discount == 1.0 else 0
+        self._gradient_memory = gradient_memory
+        self._gradient_mean: Vector = np.zeros(0)  # (n_θ,) from the first sample on
+        self._count = 0  # samples in that mean
+
+    def begin(self, levels: Vector) -> Vector:
+        """Take the mean cost from the first samples, all at one θ.
+
+        Args:
+            levels: δ + g of each, (K,).
+
+        Returns:
+            Their δ, (K,). At γ = 1 its mean is zero, so a constant in the cost is without effect.
+        """
+        if self.discount == 1.0:
+            self.mean_cost = float(levels.mean())
+        return levels - self.mean_cost
 
     def follow(self, td_error: float) -> None:
         """Move g by a sample's δ, where it is no part of the fit."""
@@ -549,12 +607,40 @@ class AverageCost:
             self.mean_cost += td_error / self._memory
 
     def without_level(self, gradient: Vector) -> Vector:
-        """∇Q (n,) of the fitted entries: without c_lambda if g follows δ."""
+        """∇Q (n_θ,), unscaled, less its running mean if g follows δ; a call a sample.
+
+        c_lambda's entry is always one, so the mean takes it out.
+        """
         if not self._memory:
             return gradient
-        fitted = gradient.copy()
-        fitted[self._position] = 0.0
-        return fitted
+        if not self._gradient_memory:
+            fitted = gradient.copy()
+            fitted[self._position] = 0.0
+            return fitted
+        # The plain mean of the first samples, then an exponential one.
+        if not self._count:
+            self._gradient_mean = np.zeros_like(gradient)
+        self._count += 1
+        window = min(self._count, self._gradient_memory)
+        self._gradient_mean += (gradient - self._gradient_mean) / window
+        centred: Vector = gradient - self._gradient_mean
+        return centred
+
+    def centre(self, td_errors: Vector, gradients: Matrix) -> tuple[Vector, Matrix]:
+        """Make a batch's fit one with an intercept at γ = 1, which g takes.
+
+        Args:
+            td_errors: δ, (K,).
+            gradients: ∇Q, (K, n_θ).
+
+        Returns:
+            Both less their means, in which c_lambda's entry vanishes; unchanged at γ < 1.
+        """
+        if self.discount != 1.0:
+            return td_errors, gradients
+        level = float(td_errors.mean())
+        self.mean_cost += level
+        return td_errors - level, gradients - gradients.mean(axis=0)
 
     def target(self, cost: Values, next_value: Values) -> Values:
         """Target of Q(s, a), of one sample or of several.
@@ -564,6 +650,10 @@ class AverageCost:
             next_value: V(s₊), a number or (K,).
         """
         return cost - self.mean_cost + self.discount * next_value
+
+    def set_scale(self, scale: Vector) -> None:
+        """Take over the scale of each entry of θ in the fit's coordinates, (n_θ,)."""
+        self._scale = float(scale[self._position])
 
     def absorb(self, fit: Fit) -> Fit:
         """Move g by its part of a fit's step; returns the rest, which is for θ."""
@@ -576,10 +666,17 @@ class AverageCost:
         return replace(fit, gradient=fit.metric() @ minimiser, minimiser=minimiser)
 
     def state_dict(self) -> State:
-        """g and the scale of its entry."""
-        return {"mean_cost": self.mean_cost, "scale": self._scale}
+        """g, the scale of its entry, and the mean of ∇Q."""
+        return {
+            "mean_cost": self.mean_cost,
+            "scale": self._scale,
+            "gradient_mean": self._gradient_mean,
+            "count": self._count,
+        }
 
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned."""
         self.mean_cost = state["mean_cost"]
         self._scale = state["scale"]
+        self._gradient_mean = state["gradient_mean"]
+        self._count = state["count"]

@@ -27,7 +27,7 @@ from cosim.core.protocols import Array
 from cosim.core.result import Result
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import functions_of, reporting, simulate
-from cosim.core.statistics import shown
+from cosim.core.statistics import Estimate, shown
 from cosim.plant import FmuPlant
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
@@ -38,6 +38,7 @@ from learning.evaluator import Evaluator
 from learning.log import COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
 from learning.training_run import HELD_OUT, TrainingRun, begin, make_run
+from learning.verdict import WORSE, Verdict, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,14 +62,14 @@ class Training(Result):
 
     Attributes:
         run: what it was.
-        parameters: the final θ.
-        rows: its log.
-        evaluation: the greedy policy on held-out noise (`Evaluator.evaluate`).
+        learned: the θ that it ended with.
+        rows: its log; the first row is of the start, before a sample.
+        evaluation: the greedy policy of `learned` on held-out noise (`Evaluator.evaluate`).
         status: `finished` or `diverged: …`.
         requires: `operation` or `simulator`, as the algorithm says.
         plant_samples: taken in all.
         start: the first θ.
-        start_J: its greedy J.
+        start_J: its greedy J on that noise.
         baselines: J of `naive` and, where known, `optimal` on the same noise.
         functions: whether the controller's were `interpreted` or `compiled`.
         without_checkpoint: why a checkpoint is missing.
@@ -76,7 +77,7 @@ class Training(Result):
     """
 
     run: TrainingRun
-    parameters: Parameters
+    learned: Parameters
     rows: list[LogRow]
     evaluation: dict[str, Any]
     status: str
@@ -98,7 +99,11 @@ class Training(Result):
             "samples": self.plant_samples,
             "seed": run.seed,
             "status": self.status,
+            "J of the start": self.start_J,
             "J": self.J,
+            "difference": shown(*self.difference, digits=3),
+            "verdict": self.verdict,
+            "updates": self.updates,
             "regret": self.regret,
         }
 
@@ -114,13 +119,34 @@ class Training(Result):
         return float(self.evaluation["J"])
 
     @property
+    def difference(self) -> Estimate:
+        """J less J of the start on the same noise, with its interval over the seeds."""
+        interval = self.evaluation["difference_interval"]
+        return Estimate(self.evaluation["difference"], interval)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the learned θ is shown to be better than the start, or worse."""
+        return verdict(self.difference)
+
+    @property
+    def parameters(self) -> Parameters:
+        """The θ to use: the learned one, or the start's where that one is worse."""
+        return self.start if self.verdict == WORSE else self.learned
+
+    @property
+    def updates(self) -> int:
+        """Updates of θ in all."""
+        return int(_total(row["updates"] for row in self.rows))
+
+    @property
     def regret(self) -> float:
         """(J − J*)/|J*| on that noise; NaN if J* is unknown."""
         regret = self.evaluation["regret"]
         return float("nan") if regret is None else float(regret)
 
     def controller(self) -> RtiNmpc:
-        """A fresh controller that has this θ."""
+        """A fresh controller that has the θ to use."""
         return nmpc(self.run.scenario, self.parameters, self.run.controller)
 
     def log(self) -> dict[str, Array]:
@@ -151,9 +177,10 @@ class Training(Result):
             self.log(),
             scaled,
             self.baselines,
-            start=self.start_J,
             title=f"{run.algorithm} ({self.requires}) on {run.scenario.name} from "
-            f"{Path(run.start).stem}, seed {run.seed}: {end}, J = {shown(self.J, digits=6)}",
+            f"{Path(run.start).stem}, seed {run.seed}: {end}, {self.verdict}\n"
+            f"J = {shown(self.J, digits=6)}, of the start {shown(self.start_J, digits=6)}, "
+            f"difference {shown(*self.difference, digits=3)}",
         )
 
     def animate(
@@ -180,11 +207,13 @@ class Training(Result):
         run = self.run
         policy = nmpc(run.scenario, self.start, run.controller)
         seed = 2 * HELD_OUT + run.seed
-        every = -(-len(self.rows) // frames)
+        # The start is in every frame already.
+        rows = self.rows[1:]
+        every = -(-len(rows) // frames)
         runs = {}
         with FmuPlant(run.scenario) as plant:
             first = simulate(plant, policy, steps, seed)
-            for row in self.rows[::every]:
+            for row in rows[::every]:
                 policy.theta = row.parameters.theta
                 title = f"after {row['samples']:.0f} samples"
                 runs[title] = simulate(plant, policy, steps, seed)
@@ -220,9 +249,12 @@ class Training(Result):
             "seed": run.seed,
             "status": self.status,
             "hyperparameters": run.configuration.model_dump(mode="json"),
+            "verdict": self.verdict,
+            "updates": self.updates,
             "parameters_hash": self.parameters.hash,
             "evaluation_seeds": run.evaluation_seeds,
             "evaluation_steps": run.evaluation_steps,
+            "start_J": self.start_J,
             **self.evaluation,
             "smallest_eigenvalue": last["smallest_eigenvalue"],
             "td_error": last["td_error"],
@@ -367,22 +399,25 @@ def run_training(
         evaluator = Evaluator(run, evaluation_plant, session.start, best)
         with reporting(progress, run.algorithm, run.samples, _Remark()) as report:
             status = session.run_to_the_end(evaluator, report)
-        parameters = session.loop.parameters
+        learned = session.loop.parameters
         training = Training(
             run=run,
-            parameters=parameters,
+            learned=learned,
             rows=session.rows,
-            evaluation=evaluator.evaluate(parameters.theta),
+            evaluation=evaluator.evaluate(learned.theta),
             status=status,
             requires=session.loop.algorithm.requires,
             plant_samples=session.loop.counts.number,
             start=session.start,
-            start_J=evaluator.start_J,
+            start_J=evaluator.start["J"],
             baselines=evaluator.baselines,
             functions=functions_of(session.loop.controller),
             without_checkpoint=session.without_checkpoint,
             wall_seconds=time.perf_counter() - clock,
         )
+    # The checkpoint's file has the θ that the run ended with.
+    if folder is not None and training.verdict == WORSE:
+        training.parameters.save(folder / PARAMETERS)
     if hasattr(progress, "end"):
         progress.end(training)
     return training
@@ -428,6 +463,8 @@ class _Session:
         """Take all samples, with log, evaluations and checkpoints; `finished` or `diverged: …`."""
         run = self.run
         number = self.loop.counts.number
+        if not self.rows:
+            self.rows.append(self.first_row(evaluator))
         while number < run.samples:
             try:
                 cost, update = self.loop.advance()
@@ -452,6 +489,17 @@ class _Session:
                 self.checkpoint()
             progress(number, row)
         return "finished"
+
+    def first_row(self, evaluator: Evaluator) -> LogRow:
+        """The line of the log before the first sample: the start, evaluated."""
+        metrics = dict.fromkeys(COLUMNS, float("nan"))
+        counts = dict.fromkeys(asdict(self.loop.counts), 0)
+        counts.pop("number")
+        metrics |= {"samples": 0, "plant_samples": 0, **counts}
+        metrics |= dict.fromkeys(("updates", "corrected", "refused"), 0)
+        metrics["smallest_eigenvalue"] = smallest_eigenvalue(self.start.blocks, self.start.theta)
+        metrics |= _greedy(evaluator.start)
+        return LogRow(metrics, self.start)
 
     def row(self, number: int, evaluator: Evaluator | None) -> LogRow:
         """A line of the log since the last one, with an evaluation where there is an evaluator."""
@@ -480,12 +528,7 @@ class _Session:
         self.costs = []
         self.updates = []
         if evaluator is not None:
-            evaluation = evaluator.evaluate(parameters.theta)
-            for name in METRICS:
-                metrics[f"greedy_{name}"] = evaluation[name]
-            for name in ("regret", "gap_closed"):
-                known = evaluation[name] is not None
-                metrics[name] = evaluation[name] if known else float("nan")
+            metrics |= _greedy(evaluator.evaluate(parameters.theta))
         return LogRow(metrics, parameters)
 
     def divergence(self, row: LogRow, evaluator: Evaluator) -> str | None:
@@ -495,7 +538,9 @@ class _Session:
         # Not NaN, where nothing was evaluated, nor infinite.
         if not limit < greedy < inf:
             return None
-        evaluations = [other["greedy_J"] for other in self.rows if isfinite(other["greedy_J"])]
+        # The start's own evaluation says nothing of learning.
+        costs = [other["greedy_J"] for other in self.rows[1:]]
+        evaluations = [cost for cost in costs if isfinite(cost)]
         # One bad evaluation may be noise, two are not.
         once = len(evaluations) < 2 or evaluations[-2] <= limit
         if once and row["samples"] < self.run.samples:
@@ -551,6 +596,15 @@ class _Session:
             self.rows.append(LogRow(metrics, self.start.with_theta(theta)))
         self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
         self.loop.load_state_dict(part_of(state, "loop"))
+
+
+def _greedy(evaluation: Mapping[str, Any]) -> dict[str, float]:
+    """Columns of the log that an evaluation fills, NaN where it knows nothing."""
+    columns = {f"greedy_{name}": evaluation[name] for name in METRICS}
+    for name in ("regret", "gap_closed"):
+        known = evaluation[name] is not None
+        columns[name] = evaluation[name] if known else float("nan")
+    return columns
 
 
 def _total(values: Iterable[float]) -> float:

@@ -41,8 +41,8 @@ def train(
 ) -> None:
     """Train a controller's θ; write parameters.toml, learning.csv, learning.png, summary.json.
 
-    Exit code 1: learning diverged; the files hold the θ that the run ended with and the summary
-    says why.
+    The learned θ is compared with the start on the same held-out noise. Exit code 1: it is worse,
+    and parameters.toml holds the start; or learning diverged, and the summary says why.
 
     Args:
         algorithm: A registered one or module:Class.
@@ -69,6 +69,7 @@ def train(
         from learning.algorithm import load_algorithm
         from learning.training import CHECKPOINT, FILES, run_training
         from learning.training_run import make_run
+        from learning.verdict import WORSE
 
         rule = load_algorithm(algorithm)
         if explain:
@@ -123,7 +124,7 @@ def train(
         _show_training(summary, out_)
         out_.note(f"the learning curve is {folder / 'learning.png'}")
         out_.json(summary)
-    if training.status != "finished":
+    if training.status != "finished" or training.verdict == WORSE:
         raise typer.Exit(1)
 
 
@@ -144,7 +145,11 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
         "{algorithm} ({requires}) on {scenario}, {samples} samples, seed {seed}: {status}"
     ).format(**summary)
     rows = [
-        ("greedy J on held-out noise", shown(summary["J"], digits=6)),
+        ("verdict", summary["verdict"]),
+        ("J of the start, on held-out noise", shown(summary["start_J"], digits=6)),
+        ("J of the learned θ, on the same", shown(summary["J"], digits=6)),
+        ("difference", shown(summary["difference"], summary["difference_interval"], 1, 3)),
+        ("updates", str(summary["updates"])),
         ("economic cost", shown(summary["economic_cost"], digits=6)),
         ("mean violation", f"{summary['mean_violation']:.6f}"),
         ("violating share", f"{100 * summary['violating_share']:.2f} %"),
@@ -153,5 +158,7 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
     ]
     if summary["regret"] is not None:
         rows.append(("regret %", shown(summary["regret"], summary["regret_interval"], 100, 3)))
-        rows.append(("gap closed %", shown(summary["gap_closed"], None, 100, 4)))
+    if summary["gap_closed"] is not None:
+        gap = shown(summary["gap_closed"], None, 100, 4)
+        rows.append(("share of the start's regret that is gone, %", gap))
     output.table(title, ("per sample", "value"), rows)

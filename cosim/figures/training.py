@@ -44,27 +44,25 @@ def training_figure(
     baselines: Mapping[str, float],
     *,
     title: str,
-    start: float = float("nan"),
 ) -> Figure:
     """Cost, violation, TD error and θ over a training's samples.
 
     Args:
-        log: columns (K,) of the training's log, NaN where not measured: `samples`, `J` of the
-            training samples since the row before, `greedy_J` and `greedy_violating_share` of the
-            policy, `td_error`.
+        log: columns (K,) of the training's log, from sample 0 on, NaN where not measured:
+            `samples`, `J` of the training samples since the row before, `greedy_J` and
+            `greedy_violating_share` of the policy, `td_error`.
         theta: a block's increments since the start in units of its learning scale, (K, entries), by
             its name.
         baselines: J by controller on the greedy policy's noise; `optimal` is J*, and costs are then
             shown as regret (J − J*)/|J*|.
         title: of the figure.
-        start: greedy J before the first sample, NaN where not measured.
     """
     best = baselines.get("optimal")
     share, error = _known(log, "greedy_violating_share"), _known(log, "td_error")
     moved = _most_moved(theta)
     panels: dict[str, Callable[[Axes], Sequence[EndLabel]]] = {
         "regret %" if best is not None else "J per sample": lambda axes: _cost(
-            axes, log, start, baselines, best
+            axes, log, baselines, best
         )
     }
     if share[0].size:
@@ -112,7 +110,6 @@ def _known(log: Mapping[str, Array], name: str) -> tuple[Array, Array]:
 def _cost(
     axes: Axes,
     log: Mapping[str, Array],
-    start: float,
     baselines: Mapping[str, float],
     best: float | None,
 ) -> list[EndLabel]:
@@ -127,8 +124,6 @@ def _cost(
     if cost.size:
         lines.append(("training", samples, shown(cost), _LINE | {"marker": "", "color": INK}))
     samples, cost = _known(log, "greedy_J")
-    if np.isfinite(start):
-        samples, cost = np.append(0.0, samples), np.append(start, cost)
     if cost.size:
         lines.append(("greedy", samples, shown(cost), _LINE | {"marker": "o", "color": GREEDY}))
     levels = {name: float(shown(level)) for name, level in baselines.items()}
@@ -152,12 +147,11 @@ def _course(
 
 
 def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) -> list[EndLabel]:
-    """Norm of the increments of blocks of θ, each (K,), from zero at the start."""
-    samples = np.append(0.0, log["samples"])
+    """Norm of the increments of blocks of θ, each (K,)."""
     labels = []
     top = 0.0
     for color, (name, norm) in zip(ENTRIES, moved.items(), strict=False):
-        axes.plot(samples, np.append(0.0, norm), color=color, linewidth=1.2)
+        axes.plot(log["samples"], norm, color=color, linewidth=1.2)
         labels.append(EndLabel(symbol(name), float(norm[-1]), color))
         top = max(top, float(norm.max()))
     if top > DECADES:

@@ -313,20 +313,16 @@ def _train_in_operation(run: TrainingRun, marks: Sequence[int]) -> Trained:
 
 def _train_in_episodes(run: TrainingRun, folder: Path) -> Trained:
     """Train as `cosim train` does it, with the checkpoint in a folder."""
-    from learning.log import COLUMNS, LogRow, to_csv  # noqa: PLC0415
+    from learning.log import to_csv  # noqa: PLC0415
     from learning.training import run_training  # noqa: PLC0415
 
     result = run_training(run, folder, resume=(folder / CHECKPOINT).is_file())
-    # The log of a study starts with θ at the start, from which its increments are counted.
-    columns = result.rows[0] if result.rows else COLUMNS
-    start = dict.fromkeys(columns, float("nan"))
-    start["samples"] = 0.0
-    rows = [LogRow(start, result.start), *result.rows]
     return Trained(
-        to_csv(rows),
-        result.parameters.to_toml(),
+        to_csv(result.rows),
+        # A study reports what the rule learned, be it worse than the start.
+        result.learned.to_toml(),
         result.status,
-        samples=int(rows[-1]["samples"]),
+        samples=int(result.rows[-1]["samples"]),
         plant_samples=result.plant_samples,
     )
 

@@ -98,13 +98,14 @@ class LinearQuadratic:
         """A θ to start from: identity Hessians and an offset model."""
         return Parameters.naive(self.problem)
 
-    def plant(self, noise=0.0, seed=0):
-        return _Plant(self, noise, seed)
+    def plant(self, noise=0.0, seed=0, constant=0.0):
+        """The plant; `constant` is added to the cost of each sample."""
+        return _Plant(self, noise, seed, constant)
 
 
 class _Plant:
-    def __init__(self, task, noise, seed):
-        self.scenario, self._task = task.scenario, task
+    def __init__(self, task, noise, seed, constant):
+        self.scenario, self._task, self._constant = task.scenario, task, constant
         self._noise, self._rng = noise, np.random.default_rng(seed)
 
     def reset(self, seed=0):
@@ -115,6 +116,7 @@ class _Plant:
     def step(self, a):
         s = self._s
         cost = float(s @ STATE_COST @ s + a @ ACTION_COST @ a)
+        cost += self._constant
         w = self._noise * self._rng.standard_normal(2)
         self._s = self._task.A @ s + self._task.B @ a + w
         return Step(self._s, cost, 0.0, np.zeros(0))

@@ -130,7 +130,7 @@ def test_a_training(scenario, problem):
     done = train("fixed", scenario, SAMPLES, evaluation_seeds=1, evaluation_steps=5, **start)
     rule = Rule(problem, done.start)
     _, _, cost = in_operation(scenario, rule)
-    (row,) = done.rows
+    _, row = done.rows
     assert row["failures"] == sum(rule.failures) > 5
     assert row["J"] == pytest.approx(cost, rel=1e-9)
 

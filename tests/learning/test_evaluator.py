@@ -23,12 +23,15 @@ def test_it_sets_theta_and_evaluates_greedily(scenario, problem, parameters):
     assert [metrics[name] for name in METRICS] == [own[name][0] for name in METRICS]
 
 
-def test_the_naive_controller_is_its_zero_the_optimum_its_one(scenario, problem, parameters):
+def test_the_start_is_its_zero_the_optimum_its_one(scenario, problem, parameters):
     other = RtiNmpc(problem, parameters.replace({"x_l": np.array([26.0, 40.0])}))
+    near = parameters.replace({"x_l": np.array([25.3, 40.0])})
     with FmuPlant(scenario) as plant:
-        evaluating = evaluator(plant, parameters, optimum=other)
-        naive, optimum = evaluating.evaluate(parameters.theta), evaluating.evaluate(other.theta)
-        assert (naive["gap_closed"], optimum["gap_closed"]) == (0.0, 1.0)
+        evaluating = evaluator(plant, near, optimum=other)
+        start, optimum = evaluating.evaluate(near.theta), evaluating.evaluate(other.theta)
+        assert (start["gap_closed"], optimum["gap_closed"]) == (0.0, 1.0)
+        assert (start["difference"], start["J"]) == (0.0, evaluating.start["J"])
+        naive = evaluating.evaluate(parameters.theta)
         best = indicators_of(plant, other, [HELD_OUT], 30)["J"][0]
         assert naive["regret"] == pytest.approx(naive["J"] / best - 1)
         assert optimum["regret"] == 0.0

@@ -15,13 +15,13 @@ def learn(*arguments, **settings):
     return train(*arguments, **settings)[0]
 
 
-def train(task, cls, samples, noise, controller=None, **settings):
-    """Controller and algorithm after training on the task."""
+def train(task, cls, samples, noise, controller=None, constant=0.0, **settings):
+    """Controller and algorithm after training on the task, whose cost has a constant added."""
     configuration = cls.Configuration.from_dict(
         {"parametrisation": "paper", "value_offset": "stage-cost", **settings}
     )
     controller = controller or RtiNmpc(task.problem, task.wrong())
-    plant = task.plant(noise)
+    plant = task.plant(noise, constant=constant)
     interaction = looped(cls, plant, controller, configuration, samples, exploration=1, seed=7)
     algorithm = interaction.algorithm
     for _ in range(samples):
@@ -60,7 +60,11 @@ def test_exact_parameters_alone_give_the_riccati_value_and_gain(linear_quadratic
     assert value_hessian(controller) == pytest.approx(linear_quadratic.P, abs=1e-6)
 
 
-EXPLORATION = {"exploration_probability": 0.5, "exploration_deviation": (1.0,)}
+EXPLORATION = {
+    "exploration_probability": 0.5,
+    "exploration_deviation": (1.0,),
+    "exploration_decay_after": None,
+}
 LQ = {"measure_offset": True, "discount": DISCOUNT, **EXPLORATION}
 ONLINE = {"prior_width": 1.0, "prior_samples": 50, "step_every": 10, **LQ}
 BATCH = {"prior_width": 3.0, "batch_size": 50, "first_batch": None, "variance_memory": 50.0, **LQ}
@@ -87,11 +91,31 @@ def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, r
     assert gain(controller) == pytest.approx(exact, abs=0.01)
 
 
-def test_the_mean_cost_is_found_beside_theta(linear_quadratic):
+def test_the_mean_cost_is_fitted_beside_theta(linear_quadratic):
     noise = 0.1
     exact = noise**2 * np.trace(linear_quadratic.riccati(1.0)[0])
-    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **BATCH | {"discount": 1.0})
+    settings = BATCH | {"discount": 1.0, "intercept": False}
+    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **settings)
     assert algorithm._average_cost.mean_cost == pytest.approx(exact, rel=0.2)
+
+
+MEAN_COST = [
+    (QLearning, {"mean_cost_memory": 5.0, **ONLINE, "discount": 1.0}),
+    (QLearning, {"mean_cost_memory": 0.0, **ONLINE, "discount": 1.0}),
+    (BatchQLearning, BATCH | {"discount": 1.0}),
+    (BatchQLearning, BATCH | {"discount": 1.0, "intercept": False}),
+    (ActorCritic, {"batch_size": 100, "exploration_deviation": (1.0,)}),
+]
+
+
+@pytest.mark.parametrize(("rule", "settings"), MEAN_COST)
+def test_a_constant_in_the_cost_does_not_change_where_theta_goes(linear_quadratic, rule, settings):
+    """At γ = 1 it moves the mean cost alone, from which no policy follows."""
+    without = learn(linear_quadratic, rule, 200, 0.3, **settings).theta
+    with_constant = learn(linear_quadratic, rule, 200, 0.3, constant=1e4, **settings).theta
+    way = without - linear_quadratic.wrong().theta
+    assert np.abs(way).max() > 0.01, "the rule must have moved"
+    assert with_constant - without == pytest.approx(0.0, abs=1e-6 * np.abs(way).max())
 
 
 @pytest.mark.slow

@@ -124,6 +124,44 @@ def test_a_mean_cost_that_follows_the_td_error_is_no_part_of_the_fit():
     assert (fitted.mean_cost, fitted.without_level(np.ones(3)).tolist()) == (6000.0, [1.0] * 3)
 
 
+def test_a_level_of_the_td_error_is_not_paid_into_theta(rng):
+    """An oracle: least squares with an intercept, whose slopes do not depend on a level."""
+    gradient = np.ones((3000, 3))  # the last entry is that of c_lambda
+    gradient[:, :2] = rng.normal([2.0, -0.5], size=(3000, 2))
+    errors = 3.0 + gradient @ [0.3, -0.2, 0.0] + 0.1 * rng.normal(size=3000)
+    slopes = np.linalg.lstsq(gradient, errors)[0][:2]
+    learned = {}
+    for memory in (0, 20):
+        average_cost = AverageCost(1.0, 2, 1.0, 0.0, memory=50, gradient_memory=memory)
+        kalman = regression(3, 1.0)
+        for row, error in zip(gradient, errors, strict=True):
+            kalman.update(error, average_cost.without_level(row))
+        assert kalman.mean[2] == pytest.approx(0.0, abs=1e-12)
+        learned[memory] = kalman.mean[:2]
+    assert learned[20] == pytest.approx(slopes, abs=0.1)
+    assert np.abs(learned[0] - slopes).max() > 0.5
+
+
+def test_a_batch_without_its_means_is_fitted_with_an_intercept(rng):
+    gradient = rng.normal([2.0, -0.5, 1.0], [1.0, 1.0, 0.0], size=(50, 3))
+    errors = 3.0 + gradient @ [0.3, -0.2, 0.0] + rng.normal(size=50)
+    average_cost = AverageCost(1.0, 2, 1.0, 100.0)
+    centred, slopes = average_cost.centre(errors, gradient)
+    with_intercept = np.linalg.lstsq(gradient, errors)[0]
+    assert np.linalg.lstsq(slopes[:, :2], centred)[0] == pytest.approx(with_intercept[:2])
+    assert average_cost.mean_cost == pytest.approx(100.0 + errors.mean())
+    discounted = AverageCost(0.9, 2, 1.0, 100.0).centre(errors, gradient)
+    assert discounted[0] is errors and discounted[1] is gradient
+
+
+def test_the_first_samples_give_the_mean_cost_and_what_is_left_of_their_td_errors():
+    levels = np.array([6010.0, 6020.0, 6060.0])
+    average_cost = AverageCost(1.0, 1, 10.0, 0.0)
+    assert average_cost.begin(levels).tolist() == [-20.0, -10.0, 30.0]
+    assert average_cost.mean_cost == 6030.0
+    assert AverageCost(0.9, 1, 10.0, 0.0).begin(levels).tolist() == levels.tolist()
+
+
 def test_mean_cost_takes_the_step_of_c_lambda():
     average_cost = AverageCost(1.0, 1, 10.0, 6000.0)
     assert average_cost.target(6001.0, 100.0) == 101.0

@@ -37,9 +37,12 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, name, tmp_
 def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(scenario):
     run = make_run(scenario, "q-learning")
     result = run_training(run)
-    assert [row["samples"] for row in result.rows] == list(range(50, 451, 50))
+    assert [row["samples"] for row in result.rows] == list(range(0, 451, 50))
     evaluated = [row["samples"] for row in result.rows if not np.isnan(row["greedy_J"])]
-    assert evaluated == [100, 200, 300, 400, 450]
+    assert evaluated == [0, 100, 200, 300, 400, 450]
+    assert result.rows[0]["greedy_J"] == result.start_J
+    assert np.array_equal(result.rows[0].parameters.theta, result.start.theta)
+    assert result.updates == sum(row["updates"] for row in result.rows) > 3
     assert result.rows[-1]["greedy_J"] == pytest.approx(result.evaluation["J"])
     assert all(row["smallest_eigenvalue"] >= 1e-3 for row in result.rows)
 
@@ -70,6 +73,36 @@ def test_a_step_that_is_not_finite_stops_the_run(scenario):
     assert result.rows[-1]["samples"] == 220, "the row of the sample at which it broke"
     assert result.rows[-1]["greedy_J"] == result.evaluation["J"]
     assert not np.array_equal(result.parameters.theta, result.start.theta)
+
+
+class Spoiling(QLearning):
+    """Moves θ once to where each cost is higher."""
+
+    def observe(self, sample):
+        if sample.number != 40:
+            return None
+        parameters = self.controller.parameters
+        self.controller.parameters = parameters.replace({"x_l": parameters["x_l"] + 30.0})
+        return Update(td_error=0.0, step=1.0, smallest_eigenvalue=1.0)
+
+
+def test_where_theta_is_worse_than_the_start_the_start_is_kept(scenario, tmp_path):
+    settings = {"samples": 100, "start": "cautious", "evaluation_seeds": 3}
+    result = run_training(make_run(scenario, "q-learning", **settings), tmp_path, rule=Spoiling)
+    assert result.verdict == "worse: the start was kept"
+    assert result.difference.interval[0] > 0
+    assert result.difference.value == pytest.approx(result.J - result.start_J)
+    assert np.array_equal(result.parameters.theta, result.start.theta)
+    assert not np.array_equal(result.learned.theta, result.start.theta)
+    stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
+    assert np.array_equal(stored.theta, result.start.theta)
+
+
+def test_a_theta_that_stays_shows_no_difference(scenario):
+    run = training.make_run("fixed", scenario, start="cautious", evaluation_seeds=3)
+    result = run_training(run)
+    assert (result.verdict, result.difference.value) == ("no difference shown", 0.0)
+    assert result.updates == 0
 
 
 class Trying(QLearning):

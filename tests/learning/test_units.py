@@ -1,13 +1,21 @@
 """The rules in other units of states, inputs and cost: the same policy, sample by sample."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from controllers import reactor
+from controllers.errors import ModelError
+from controllers.factories import tuned
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
+from cosim import Scenario
 from learning import ActorCritic, BatchQLearning, QLearning
+from learning.backed_off import add_reserve, back_off
 from learning.training_run import starting_parameters
 from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
+from tests.helpers.other_zeros import COUNTINGS
 from tests.helpers.training import looped
 
 SAMPLES = 160
@@ -62,3 +70,37 @@ def test_a_rule_learns_the_same_policy_in_other_units(scenario, cls):
     other_way = (other.theta - other_start.theta) / other.blocks.scale
     assert other_way == pytest.approx(way, abs=1e-5 * np.abs(way).max())
     assert corrected == other_corrected
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("paper", marks=pytest.mark.slow),
+        "reactor",
+        pytest.param("tanks", marks=pytest.mark.slow),
+    ],
+)
+def test_the_first_days_back_offs_do_not_depend_on_units_or_their_zeros(name):
+    """No quantity is guessed from the zero of its unit: 10 % of 350 K is not 10 % of 77 °C."""
+    counting = COUNTINGS[name]
+    own = Scenario.load(name)
+    other = counting.scenario(own, f"tests.helpers.other_zeros:{name}_model")
+    back_offs = []
+    for counted in (own, other):
+        start = tuned(counted).parameters
+        found = back_off(start, counted, samples=700)
+        found = add_reserve(found, counted, samples=200)
+        both = [found["x_l"] - start["x_l"], start["x_u"] - found["x_u"]]
+        back_offs.append(np.concatenate(both))
+    assert (back_offs[0] > 0).any()
+    factors = np.tile(counting.states[0], 2)
+    assert back_offs[1] / factors == pytest.approx(back_offs[0], rel=1e-4, abs=1e-7)
+
+
+def test_a_temperature_without_a_magnitude_is_refused():
+    own = reactor.model()
+    feed, temperature = own.disturbances
+    unknown = dataclasses.replace(temperature, magnitude=None)
+    model = dataclasses.replace(own, disturbances=(feed, unknown))
+    with pytest.raises(ModelError, match="Tf is a temperature in K"):
+        _ = model.disturbance_magnitudes

@@ -36,8 +36,10 @@ def test_train_writes_theta_log_summary_and_recording(trained):
     assert summary["hyperparameters"]["prior_samples"] == 20
     assert (summary["status"], summary["samples"], summary["seed"]) == ("finished", 200, 5)
     assert summary["regret"] is not None, "the optimum need not be named"
+    assert summary["difference"] == pytest.approx(summary["J"] - summary["start_J"])
+    assert (summary["verdict"], summary["updates"]) == ("no difference shown", 10)
     log = (folder / "learning.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in log] == ["samples", "50", "100", "150", "200"]
+    assert [row.split(",")[0] for row in log] == ["samples", "0", "50", "100", "150", "200"]
     assert (folder / "training.rrd").stat().st_size > 10_000
 
 

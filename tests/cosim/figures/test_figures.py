@@ -82,16 +82,16 @@ def test_the_users_settings_neither_matter_nor_change(tmp_path):
     assert styled == plain
 
 
-SAMPLES = np.array([1000.0, 2000.0, 3000.0, 4000.0])
+SAMPLES = np.array([0.0, 1000.0, 2000.0, 3000.0, 4000.0])
 LOG = {
     "samples": SAMPLES,
-    "J": np.array([300.0, 200.0, 150.0, 120.0]),
-    "greedy_J": np.array([np.nan, 150.0, np.nan, 110.0]),
-    "greedy_violating_share": np.array([np.nan, 0.5, np.nan, 0.1]),
-    "td_error": np.array([9.0, 5.0, np.nan, 2.0]),
+    "J": np.array([np.nan, 300.0, 200.0, 150.0, 120.0]),
+    "greedy_J": np.array([400.0, np.nan, 150.0, np.nan, 110.0]),
+    "greedy_violating_share": np.array([0.7, np.nan, 0.5, np.nan, 0.1]),
+    "td_error": np.array([np.nan, 9.0, 5.0, np.nan, 2.0]),
 }
 THETA = {
-    name: size * np.ones((4, 2)) for size, name in enumerate(("x_l", "c_f", "b_l", "B_l", "x_u"))
+    name: size * np.ones((5, 2)) for size, name in enumerate(("x_l", "c_f", "b_l", "B_l", "x_u"))
 }
 BASELINES = {"naive": 200.0, "optimal": 100.0}
 
@@ -101,7 +101,7 @@ def panels(figure):
 
 
 def test_costs_are_shown_as_regret_where_the_optimum_is_known():
-    axes = panels(training_figure(LOG, THETA, BASELINES, title="t", start=400.0))["regret %"]
+    axes = panels(training_figure(LOG, THETA, BASELINES, title="t"))["regret %"]
     training, greedy = axes.lines[:2]
     assert np.allclose(training.get_ydata(), [200.0, 100.0, 50.0, 20.0])
     assert np.allclose(greedy.get_xdata(), [0.0, 2000.0, 4000.0])

@@ -109,7 +109,7 @@ def solver(scenario, theta):
     from controllers.theta import Parameters, ThetaBlocks, symbolic_theta
 
     problem = Problem.from_scenario(scenario)
-    blocks = ThetaBlocks.of(problem)
+    blocks = ThetaBlocks.from_problem(problem)
     parameters = Parameters.naive(problem, blocks).with_theta(theta)
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
     symbols = symbolic_theta(problem, blocks)

@@ -52,9 +52,9 @@ def preset_sources() -> list[dict[str, bytes]]:
             problem = Problem.from_scenario(Scenario.load(preset))
             names = tuple(parameter.name for parameter in problem.model.parameters)
             for slack_weights in (False, True):
-                blocks = ThetaBlocks.of(problem, slack_weights=slack_weights)
+                blocks = ThetaBlocks.from_problem(problem, slack_weights=slack_weights)
                 RtiNmpc(problem, Parameters.naive(problem, blocks)).compile(LONG)
-            blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=names)
+            blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=names)
             Rollout(problem, Parameters.naive(problem, blocks), Features(problem))
     return found
 

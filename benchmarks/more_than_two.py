@@ -61,7 +61,7 @@ class Loop:
         self.scenario = scenario
         self.plant = plant = PlantProblem.from_scenario(scenario)
         problem, self.tuned = plant.problem, tuned(scenario).parameters
-        blocks, model = ThetaBlocks.of(problem, model_parameters=UNSURE), problem.model
+        blocks, model = ThetaBlocks.from_problem(problem, model_parameters=UNSURE), problem.model
         own = {block.name: self.tuned[block.name] for block in self.tuned.blocks}
         self.start = Parameters.naive(problem, blocks).replace(own)
         (x, u, d, _), p = model.symbols(), ca.DM(plant.parameters)

@@ -23,7 +23,7 @@ def measure(scenario, steps=SAMPLES):
     rows, sums = [], {}
     for horizon, kind, more in cases:
         problem = Problem.from_scenario(scenario.replace({"controller": {"horizon": horizon}}))
-        theta = Parameters.naive(problem, ThetaBlocks.of(problem, **more))
+        theta = Parameters.naive(problem, ThetaBlocks.from_problem(problem, **more))
         controller = RtiNmpc(problem, theta, hessian=scenario.controller.hessian)
         interpreted = [walk(controller, steps) for _ in range(REPETITIONS)]
         compile_functions(controller)

@@ -39,27 +39,35 @@ def _flows(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX,
     P100, F200 = ca.vertsplit(u)
     _, F1, T1, T200 = ca.vertsplit(w)
     a, b, c, d, e, f, g, h, _, _, UA2, Cp, lambda_, lambda_s, F3 = ca.vertsplit(p)
+    # Temperatures of the liquid, of the vapour and of the steam.
     T2 = a * P2 + b * X2 + c
     T3 = d * P2 + e
     T100 = f * P100 + g
+    # Duties of the heater and of the condenser.
     UA1 = h * (F1 + F3)
     Q100 = UA1 * (T100 - T2)
-    F4 = (Q100 - F1 * Cp * (T2 - T1)) / lambda_
     Q200 = UA2 * (T3 - T200) / (1 + UA2 / (2 * Cp * F200))
-    return F1 - F4, F4, Q200 / lambda_, Q100 / lambda_s
+
+    F4 = (Q100 - F1 * Cp * (T2 - T1)) / lambda_
+    F5 = Q200 / lambda_
+    F100 = Q100 / lambda_s
+    return F1 - F4, F4, F5, F100
 
 
 def _ode(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     """Rates of X2 and P2: M X2' = F1 X1 − F2 X2 and C P2' = F4 − F5."""
-    X2, (X1, F1, _, _) = x[0], ca.vertsplit(w)
-    M, C = p[8], p[9]
+    X2 = x[0]
+    X1, F1, _, _ = ca.vertsplit(w)
+    M = p[8]
+    C = p[9]
     F2, F4, F5, _ = _flows(x, u, w, p)
     return ca.vertcat((F1 * X1 - F2 * X2) / M, (F4 - F5) / C)
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     """Cost 10.09 (F2 + F3) + 600 F100 + 0.6 F200 per minute."""
-    F200, F3 = u[1], p[14]
+    F200 = u[1]
+    F3 = p[14]
     F2, _, _, F100 = _flows(x, u, w, p)
     return 10.09 * (F2 + F3) + 600 * F100 + 0.6 * F200
 

@@ -23,11 +23,18 @@ if TYPE_CHECKING:
 
 
 def nmpc(scenario: Scenario, parameters: Parameters, kind: str = "rti") -> RtiNmpc:
-    """NMPC for a scenario with given θ, `rti` or `converged`; ControllerError on another `kind`.
+    """NMPC for a scenario with given θ; the RTI-NMPC solves as many QPs a sample as that says.
 
-    The RTI-NMPC solves as many QPs a sample as the scenario says.
+    Args:
+        scenario: The scenario.
+        parameters: θ.
+        kind: `rti` or `converged`.
+
+    Raises:
+        ControllerError: Another `kind`.
     """
-    problem, settings = Problem.from_scenario(scenario), scenario.controller
+    problem = Problem.from_scenario(scenario)
+    settings = scenario.controller
     if kind == "converged":
         return ConvergedNmpc(problem, parameters, backend=settings.backend)
     if kind != "rti":
@@ -42,22 +49,40 @@ def nmpc(scenario: Scenario, parameters: Parameters, kind: str = "rti") -> RtiNm
 
 
 def value_offset(scenario: Scenario, problem: Problem) -> float:
-    """c_λ at the start, as the scenario says: ℓ_s or ℓ_s/(1−γ)."""
+    """c_λ at the start, as the scenario says: ℓ_s or ℓ_s/(1−γ).
+
+    Args:
+        scenario: The scenario.
+        problem: Its problem.
+    """
     discounted = scenario.controller.value_offset == "discounted"
     return problem.value_level() if discounted else problem.reference_cost
 
 
 def naive(scenario: Scenario, kind: str = "rti") -> RtiNmpc:
-    """NMPC with the paper's naive guess, c_λ as the scenario says: baseline (a)."""
+    """NMPC with the paper's naive guess, c_λ as the scenario says: baseline (a).
+
+    Args:
+        scenario: The scenario.
+        kind: `rti` or `converged`.
+    """
     problem = Problem.from_scenario(scenario)
-    found = Parameters.naive(problem).replace({"c_lambda": value_offset(scenario, problem)})
-    return nmpc(scenario, found, kind)
+    parameters = Parameters.naive(problem)
+    parameters = parameters.replace({"c_lambda": value_offset(scenario, problem)})
+    return nmpc(scenario, parameters, kind)
 
 
 def from_toml(scenario: Scenario, text: str, path: str | Path, kind: str = "rti") -> RtiNmpc:
-    """NMPC with θ from the text of a parameters file; `path` names it in messages."""
-    found = Parameters.from_toml(text, Problem.from_scenario(scenario), path)
-    return nmpc(scenario, found, kind)
+    """NMPC with θ from the text of a θ file.
+
+    Args:
+        scenario: The scenario.
+        text: Text of the file.
+        path: What the file is called in messages.
+        kind: `rti` or `converged`.
+    """
+    parameters = Parameters.from_toml(text, Problem.from_scenario(scenario), path)
+    return nmpc(scenario, parameters, kind)
 
 
 def tuned(scenario: Scenario) -> RtiNmpc:
@@ -65,8 +90,9 @@ def tuned(scenario: Scenario) -> RtiNmpc:
     from controllers.economic import tune  # noqa: PLC0415
 
     problem = Problem.from_scenario(scenario)
-    found = tune(problem).parameters.replace({"c_lambda": value_offset(scenario, problem)})
-    return nmpc(scenario, found)
+    parameters = tune(problem).parameters
+    parameters = parameters.replace({"c_lambda": value_offset(scenario, problem)})
+    return nmpc(scenario, parameters)
 
 
 def lqr(scenario: Scenario) -> Lqr:

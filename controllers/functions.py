@@ -25,9 +25,18 @@ Expression = TypeVar("Expression", ca.SX, ca.MX)
 
 
 def consecutive(sizes: Mapping[str, int], first: int = 0) -> dict[str, slice]:
-    """Slices, by name, of parts that follow each other from an index on."""
-    ends = np.cumsum([first, *sizes.values()]).tolist()
-    return {name: slice(*ends[i : i + 2]) for i, name in enumerate(sizes)}
+    """Slices of parts that follow each other.
+
+    Args:
+        sizes: Sizes of the parts by name.
+        first: Index of the first part's first entry.
+    """
+    slices = {}
+    start = first
+    for name, size in sizes.items():
+        slices[name] = slice(start, start + size)
+        start += size
+    return slices
 
 
 class StackedFunction:
@@ -35,11 +44,17 @@ class StackedFunction:
 
     `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
     read the results by `part`, or `matrix`. A call allocates nothing. All results share one flat
-    array, `stack`, so that one copy keeps them all. The inputs follow each other in one array but
-    for the `shared` ones, which are read from other memory, such as another function's output. Own
-    inputs and results are one array, `memory`: a given one, or one with `room` behind them for
-    more, by name and size; `places` are slices of it by name, `slices` the results' in `stack`. The
+    array, `stack`, so that one copy keeps them all. Inputs that are not shared, and results, are
+    one array, `memory`; `places` are slices of it by name, `slices` the results' in `stack`. The
     expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
+
+    Args:
+        name: Name of the function, in C too.
+        arguments: Symbols by the names of the inputs.
+        results: Expressions by name.
+        shared: Arrays of inputs that are read from other memory, such as another function's output.
+        room: Sizes, by name, of more parts that `memory` has behind the function's own.
+        memory: The memory to use in place of a new one.
     """
 
     def __init__(
@@ -61,28 +76,35 @@ class StackedFunction:
             {"cse": True},
         )
         shared = shared or {}
-        sizes = {name: argument.numel() for name, argument in arguments.items()}
-        for name_, array in shared.items():
-            _check_array(name_, array, sizes[name_])
-        own = {name: size for name, size in sizes.items() if name not in shared}
-        all_sizes = own | {"stack": function.numel_out(0)} | dict(room or {})
-        total = sum(all_sizes.values())
+        sizes = {}
+        for input_name, argument in arguments.items():
+            if input_name in shared:
+                _check_array(input_name, shared[input_name], argument.numel())
+            else:
+                sizes[input_name] = argument.numel()
+        sizes["stack"] = function.numel_out(0)
+        sizes |= dict(room or {})
+        total = sum(sizes.values())
         self.memory: Vector = np.zeros(total) if memory is None else memory
         _check_array("memory", self.memory, total)
-        self.places = consecutive(all_sizes)
-        self.inputs = {
-            name: shared[name] if name in shared else self.memory[self.places[name]]
-            for name in sizes
-        }
+        self.places = consecutive(sizes)
+        self.inputs: dict[str, Vector] = {}
+        for input_name in arguments:
+            if input_name in shared:
+                self.inputs[input_name] = shared[input_name]
+            else:
+                self.inputs[input_name] = self.memory[self.places[input_name]]
         self.stack: Vector = self.memory[self.places["stack"]]
+
+        # CasADi keeps pointers: the arrays must stay where they are.
         self._buffer, self._evaluate = function.buffer()
         for i, array in enumerate(self.inputs.values()):
             self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]
         self._buffer.set_res(0, memoryview(self.stack))  # type: ignore[arg-type,call-arg]
-        sizes = {name: result.numel() for name, result in results.items()}
-        self.slices = consecutive(sizes)
-        self.places |= consecutive(sizes, self.places["stack"].start)
-        self.shapes = {name: result.shape for name, result in results.items()}
+        result_sizes = {key: result.numel() for key, result in results.items()}
+        self.slices = consecutive(result_sizes)
+        self.places |= consecutive(result_sizes, self.places["stack"].start)
+        self.shapes = {key: result.shape for key, result in results.items()}
 
     def __call__(self) -> None:
         """Evaluate at `inputs`, into `stack`; NaN where a solver inside the function fails."""
@@ -96,13 +118,23 @@ class StackedFunction:
         return bool(np.isfinite(self.stack).all())
 
     def part(self, name: str, memory: Vector | None = None) -> Vector:
-        """View of a part of the memory, or of a copy of it, flat: a result by its columns."""
-        return (self.memory if memory is None else memory)[self.places[name]]
+        """View of a part of the memory, flat: a result by its columns.
+
+        Args:
+            name: An input that is not shared, a result, or a part of the `room`.
+            memory: A copy of the memory to take it from.
+        """
+        source = self.memory if memory is None else memory
+        return source[self.places[name]]
 
     def matrix(self, name: str, memory: Vector | None = None) -> Matrix:
         """View of a result as the transpose of its expression: shape (columns, rows).
 
         What is a matrix is the caller's to say: one column may be either.
+
+        Args:
+            name: A result.
+            memory: A copy of the memory to take it from.
         """
         rows, columns = self.shapes[name]
         return self.part(name, memory).reshape(columns, rows)
@@ -146,6 +178,10 @@ def work_sizes(prefix: str, function: ca.Function) -> dict[str, int]:
 
     They are the lengths of `arg`, `res`, `iw` and `w`. The first two exceed the numbers of inputs
     and outputs where the function calls others: CasADi keeps their pointers behind its own.
+
+    Args:
+        prefix: What the constants' names begin with.
+        function: The function.
     """
     return {
         f"{prefix}_ARG": function.sz_arg(),
@@ -169,8 +205,14 @@ def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     whose arrays must have the sizes of `work_sizes`, and which returns 0 unless it fails. None of
     them needs a memory checked out, so `mem` is 0. Compiled without contraction of products
     and sums (-ffp-contract=off) and without fast-math it gives the interpreter's bytes. The same
-    functions give the same source. The names of its helpers begin with `name`. Raises
-    ControllerError where a function cannot be C by itself (`not_in_c`).
+    functions give the same source.
+
+    Args:
+        functions: The functions.
+        name: What the names of the source's helpers begin with.
+
+    Raises:
+        ControllerError: A function cannot be C by itself (`not_in_c`).
     """
     reason = not_in_c(functions)
     if reason is not None:
@@ -207,7 +249,9 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
     """
     if switch() == "never":
         return None
-    files = {name: s.encode() if isinstance(s, str) else s for name, s in sources.items()}
+    files = {}
+    for name, source in sources.items():
+        files[name] = source.encode() if isinstance(source, str) else source
     compiler = find_compiler()
     system = [sys.platform, platform.machine().lower()]
     stored = build_name(files, system)
@@ -225,7 +269,12 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
 
 
 def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
-    """Name of a library by its C files and what it is built for and with."""
+    """Name of a library: a digest of its C files and of what it is built for and with.
+
+    Args:
+        files: C files by name.
+        system: Platform, architecture and, for what is compiled here, compiler and flags.
+    """
     content = hashlib.sha256("\0".join(system).encode())
     for name in sorted(files):
         content.update(f"\0{name}\0{len(files[name])}\0".encode() + files[name])

@@ -15,13 +15,13 @@ from controllers.problem import Problem
 from controllers.qp import Mask
 from cosim.core.protocols import Matrix
 
-TOLERANCE = 0.01
+INTEGRATION_TOLERANCE = 0.01
 """Share of a state's range by which a sample's prediction may be off without a word."""
-MOST = 1000
+MAX_SUBSTEPS = 1000
 """Most substeps that are tried."""
-CORNERS = 16
+MAX_CORNERS = 16
 """Most corners of the bounds that are tried; of more, each bound alone."""
-MARGIN = 1e-6
+GROWTH_MARGIN = 1e-6
 """How far above 1 a mode's growth must be to count as one: rounding is below."""
 
 
@@ -33,8 +33,8 @@ class Integration:
     of its bounds.
     `state` names the state where it is largest, `at_reference` says whether that is at the
     reference or at the bounds. `suffices` is a number of substeps, the problem's own doubled and
-    doubled again, whose error is below `TOLERANCE`; None where `MOST` is not enough. `unstable`
-    says whether a mode that decays at the reference grows in the prediction.
+    doubled again, whose error is below `INTEGRATION_TOLERANCE`; None where `MAX_SUBSTEPS` is not
+    enough. `unstable` says whether a mode that decays at the reference grows in the prediction.
     """
 
     error: float
@@ -45,15 +45,16 @@ class Integration:
 
     @property
     def coarse(self) -> bool:
-        """Whether the error is above `TOLERANCE`."""
-        return not self.error <= TOLERANCE
+        """Whether the error is above `INTEGRATION_TOLERANCE`."""
+        return not self.error <= INTEGRATION_TOLERANCE
 
     @property
     def remedy(self) -> str:
         """What mends a coarse integration, in a few words."""
         if self.suffices is None:
             return (
-                f"even substeps = {MOST} is too few: replace the fast states by what they settle at"
+                f"even substeps = {MAX_SUBSTEPS} is too few: replace the fast states by what they "
+                "settle at"
             )
         return f"set substeps = {self.suffices} in the table [controller]"
 
@@ -67,19 +68,33 @@ class _Predictor:
         rate = model.ode(x, u, d, p)
         slope = ca.jacobian(rate, ca.vertcat(x, u))
         rates = ca.Function("rates", [x, u, d, p], [ca.densify(rate), ca.densify(ca.vec(slope))])
-        nominal = model.nominal_disturbance, model.nominal_parameters
-        at_nominal: Any = rates(x, u, *map(ca.SX, map(ca.DM, nominal)))
+        nominal_d = ca.SX(ca.DM(model.nominal_disturbance))
+        nominal_p = ca.SX(ca.DM(model.nominal_parameters))
+        at_nominal: Any = rates(x, u, nominal_d, nominal_p)
         self._rates = ca.Function("rates", [x, u], at_nominal)
         self.length = problem.sampling_time / model.time_unit
 
     def slopes(self, x: Matrix, u: Matrix) -> tuple[Matrix, Matrix]:
-        """Rates (P, n) and their derivatives by (x, u), (P, n, n+m), at x (P, n) and u (P, m)."""
+        """Rates of the states and their derivatives by (x, u) at P points.
+
+        Args:
+            x: States, (P, n).
+            u: Actions, (P, m).
+
+        Returns:
+            The rates (P, n), and the derivatives (P, n, n+m).
+        """
         rates, slopes = (value.full().T for value in self._rates(x.T, u.T))
         n = x.shape[1]
         return rates, slopes.reshape(len(x), -1, n).transpose(0, 2, 1)
 
     def modes(self, x: Matrix, u: Matrix) -> NDArray[np.complex128]:
-        """Eigenvalues (P, n) of the rates' derivatives by x; 0 where these are not finite."""
+        """Eigenvalues (P, n) of the rates' derivatives by x; 0 where these are not finite.
+
+        Args:
+            x: States, (P, n).
+            u: Actions, (P, m).
+        """
         _, slopes = self.slopes(x, u)
         by_state = slopes[:, :, : x.shape[1]]
         finite: Mask = np.array(np.isfinite(by_state).all(axis=(1, 2)))
@@ -90,6 +105,7 @@ class _Predictor:
         count, n = x.shape
         m = u.shape[1]
         by_action = np.hstack([np.zeros((m, n)), np.eye(m)])
+        # A state and its derivatives side by side, which the variational equation carries on.
         state = np.zeros((count, n, 1 + n + m))
         state[:, :, 0] = x
         state[:, :, 1 : 1 + n] = np.eye(n)
@@ -97,8 +113,8 @@ class _Predictor:
 
         def rate(state: Matrix) -> Matrix:
             value, slope = self.slopes(state[:, :, 0], u)
-            moved = slope[:, :, :n] @ state[:, :, 1:] + slope[:, :, n:] @ by_action
-            return np.concatenate([value[:, :, None], moved], axis=2)
+            variation = slope[:, :, :n] @ state[:, :, 1:] + slope[:, :, n:] @ by_action
+            return np.concatenate([value[:, :, None], variation], axis=2)
 
         for _ in range(substeps):
             k1 = rate(state)
@@ -115,24 +131,29 @@ def measure_integration(problem: Problem) -> Integration:
     That is at the reference and at corners of the bounds. A corner from which the model's own
     solution is not finite is passed over.
     """
-    n, substeps = problem.n_states, problem.substeps
+    n = problem.n_states
+    substeps = problem.substeps
     points = _points(problem)
-    x, u = points[:, :n], points[:, n:]
+    x = points[:, :n]
+    u = points[:, n:]
     predict = _Predictor(problem)
     modes = predict.modes(x, u)
     length = predict.length
     widths = problem.upper - problem.lower
+    # A derivative counts as what it makes of the whole width of the bounds.
     scale = np.hstack([1.0, widths]) / widths[:n, None]
     suffices = None
     with np.errstate(all="ignore"):  # a prediction that runs away is a result here
-        coarse = present = predict(x, u, substeps)
-        while substeps <= MOST:
+        coarse = predict(x, u, substeps)
+        present = coarse
+        while substeps <= MAX_SUBSTEPS:
             finer = predict(x, u, 2 * substeps)
             grows = _grows(modes, length / substeps)
-            if _errors(present, finer, scale, grows).max() <= TOLERANCE / 2:
+            if _errors(present, finer, scale, grows).max() <= INTEGRATION_TOLERANCE / 2:
                 suffices = substeps
                 break
-            substeps, present = 2 * substeps, finer
+            substeps = 2 * substeps
+            present = finer
         grows = _grows(modes, length / problem.substeps)
         errors = _errors(coarse, finer, scale, grows)
     point, state = np.unravel_index(int(errors.argmax()), errors.shape)
@@ -150,29 +171,34 @@ def check_integration(problem: Problem) -> Integration:
 
     Raises ModelError at a mode that decays in the model and grows in the prediction.
     """
-    found, model = measure_integration(problem), problem.model
-    if found.unstable:
+    model = problem.model
+    integration = measure_integration(problem)
+    if integration.unstable:
         raise ModelError(
             f"model '{model.name}' is too stiff for substeps = {problem.substeps}: at the "
             "reference a mode that decays grows in the prediction of a sample of "
-            f"{problem.sampling_time:g} s; {found.remedy}"
+            f"{problem.sampling_time:g} s; {integration.remedy}"
         )
-    if found.coarse:
-        where = "at the reference" if found.at_reference else "at the bounds"
-        size = f"{100 * found.error:.0f} % of" if found.error < 10 else "many times"
+    if integration.coarse:
+        where = "at the reference" if integration.at_reference else "at the bounds"
+        size = "many times"
+        if integration.error < 10:
+            size = f"{100 * integration.error:.0f} % of"
         warn(
             f"model '{model.name}' is integrated coarsely by substeps = {problem.substeps}: "
             f"{where} a prediction over {problem.sampling_time:g} s is off by {size} the range of "
-            f"{found.state}; {found.remedy}",
+            f"{integration.state}; {integration.remedy}",
             ModelWarning,
         )
-    return found
+    return integration
 
 
 def _points(problem: Problem) -> Matrix:
     """The reference, then corners of the bounds of (x, u), one a row."""
-    lower, upper, reference = problem.lower, problem.upper, problem.reference
-    if 2 ** len(lower) <= CORNERS:
+    lower = problem.lower
+    upper = problem.upper
+    reference = problem.reference
+    if 2 ** len(lower) <= MAX_CORNERS:
         corners = list(product(*zip(lower, upper, strict=True)))
     else:
         corners = []
@@ -203,4 +229,4 @@ def _grows(modes: NDArray[np.complex128], h: float) -> Mask:
     """Whether of modes (P, n) one that decays is outside of the stability region of a step h."""
     z = modes * h
     growth = np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)
-    return np.asarray(((modes.real < 0) & (growth > 1 + MARGIN)).any(axis=1))
+    return np.asarray(((modes.real < 0) & (growth > 1 + GROWTH_MARGIN)).any(axis=1))

@@ -46,14 +46,33 @@ class Model:
     """A continuous-time model x' = ode(x, u, d, p) with the economic cost ℓ(x, u, d, p).
 
     The states x, actions u, disturbances d and parameters p are columns in the order of their
-    quantities; `economic_cost` is ℓ; `name` is for messages; `time_unit` is the length in seconds
-    of the unit of time in which `ode` counts; `uncertain` names the parameters that a plant may
-    well have otherwise, which identification fits unless told which.
+    quantities. `ode` and `economic_cost` are called once with symbols when the model is made.
 
-    `ode` returns a column of n expressions, or a list, tuple or array of n scalars; the cost is
-    one scalar. Both are called once with symbols when the model is made. Raises ModelError in one
-    line where that fails, where they return something else or depend on what is no entry of x, u, d
-    and p, and on names, values or units that do not fit.
+    Args:
+        name: Name of the model, for messages.
+        states: Quantities of x.
+        actions: Quantities of u.
+        disturbances: Quantities of d, whose nominal values the controller predicts with.
+        parameters: Quantities of p.
+        ode: Function (x, u, d, p) that returns a column of n expressions, or a list, tuple or array
+            of n scalars: the rates of the states.
+        economic_cost: Function (x, u, d, p) that returns one scalar ℓ.
+        time_unit: Length in seconds of the unit of time in which `ode` counts.
+        uncertain: Names of the parameters that a plant may well have otherwise, which
+            identification fits where it is not said which.
+
+    Raises:
+        ModelError: A function fails, returns something else or depends on what is no entry of x, u,
+            d and p, or names, values or units do not fit.
+
+    Example:
+        >>> rate = lambda x, u, d, p: (u[0] + d[0] - x[0]) / p[0]
+        >>> cost = lambda x, u, d, p: x[0] ** 2 + u[0] ** 2
+        >>> level, inflow, rain = Quantity("h", "m"), Quantity("q", "m"), Quantity("d", "m")
+        >>> area = Quantity("A", "m2", 2.0)
+        >>> model = Model("tank", (level,), (inflow,), (rain,), (area,), rate, cost)
+        >>> model.nominal_parameters
+        array([2.])
     """
 
     name: str
@@ -184,18 +203,22 @@ class Model:
         rest = [quantity for quantity in self.disturbances if quantity.name not in names]
         if len(moved) != len(names):
             raise ModelError(f"model '{self.name}' has not all of {', '.join(names)} to measure")
+        # Where each of the present disturbances is among those that stay and those that moved.
         order = [[*rest, *moved].index(quantity) for quantity in self.disturbances]
-        own = len(self.parameters)
+        count = len(self.parameters)
 
-        def of(expression: Expression) -> Expression:
-            return lambda x, u, d, p: expression(x, u, ca.vertcat(d, p[own:])[order], p[:own])
+        def rearranged(expression: Expression) -> Expression:
+            def call(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
+                return expression(x, u, ca.vertcat(d, p[count:])[order], p[:count])
+
+            return call
 
         return replace(
             self,
             disturbances=tuple(rest),
             parameters=(*self.parameters, *moved),
-            ode=of(self.ode),
-            economic_cost=of(self.economic_cost),
+            ode=rearranged(self.ode),
+            economic_cost=rearranged(self.economic_cost),
         )
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
@@ -209,7 +232,14 @@ class Model:
 
 
 def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float | ca.SX, substeps: int) -> ca.SX:
-    """x after `substeps` classical RK4 steps of length h of x' = rate(x)."""
+    """x after some classical RK4 steps of x' = rate(x).
+
+    Args:
+        rate: Right-hand side.
+        x: Start: a vector, or vectors side by side.
+        h: Length of a step.
+        substeps: Number of steps.
+    """
     for _ in range(substeps):
         k1 = rate(x)
         k2 = rate(x + h / 2 * k1)
@@ -222,11 +252,14 @@ def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float | ca.SX, subs
 def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function:
     """Discrete-time model f(x, u, d, p) → x₊ for inputs held over one sample.
 
-    `sampling_time` in seconds, in so many RK4 steps.
+    Args:
+        model: The model.
+        sampling_time: Length of a sample in s.
+        substeps: Number of RK4 steps a sample.
     """
     x, u, d, p = model.symbols()
     h = sampling_time / model.time_unit / substeps
-    x_next = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, substeps)
+    x_next = runge_kutta(lambda state: model.ode(state, u, d, p), x, h, substeps)
     return ca.Function("f", [x, u, d, p], [x_next], ["x", "u", "d", "p"], ["x_next"])
 
 

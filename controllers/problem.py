@@ -23,43 +23,47 @@ VECTORS = (
     *("penalty_linear", "penalty_quadratic", "reference_state", "reference_action"),
 )
 """A problem's vectors, by state but for the actions'."""
-ACTIVE = 1e-6
+ACTIVE_SHARE = 1e-6
 """Share of a bound's width within which the reference counts as at the bound."""
 
 
 @dataclass(frozen=True)
 class Units:
-    """The units `state` ρ_x (n,), `action` ρ_u (m,), `cost` κ; and `dearest`, max_i μ_i ρ_i.
+    """The units `state` ρ_x (n,), `action` ρ_u (m,), `cost` κ; and `largest_multiplier`.
 
-    μ are the multipliers of the state bounds at the reference; κ is the power of ten above
-    `dearest`, so that slack weights κ/ρ_x are exact. Where no bound is active, `dearest` is 0 and
-    κ is that of the cost's curvature, max_i |∂²ℓ/∂w_i²| ρ_i², or of the cost itself.
+    The last is max_i μ_i ρ_i with the multipliers μ of the state bounds at the reference; κ is the
+    power of ten above it, so that slack weights κ/ρ_x are exact penalties. Where no bound is active
+    it is 0, and κ is that of the cost's curvature, max_i |∂²ℓ/∂w_i²| ρ_i², or of the cost itself.
     """
 
     state: Vector
     action: Vector
     cost: float
-    dearest: float
+    largest_multiplier: float
 
     @classmethod
-    def of(cls, problem: Problem) -> Units:
+    def from_problem(cls, problem: Problem) -> Units:
         """Units of a problem; raises ModelError where the multipliers cannot be computed."""
-        n, widths = problem.n_states, problem.upper - problem.lower
-        both = np.array([10.0**power for power in np.rint(_power(widths))])
+        n = problem.n_states
+        powers = np.rint(_power(problem.upper - problem.lower))
+        both = np.array([10.0**power for power in powers])
         sizes = _cost_sizes(problem, both)
-        largest = next(iter(sizes.values()), None)
-        unit = 1.0 if largest is None else float(10.0 ** (np.floor(_power(largest)) + 1))
-        return cls(both[:n], both[n:], unit, sizes.get("dearest", 0.0))
+        cost = 1.0
+        if sizes:  # the first one is what the cost is counted in
+            first = next(iter(sizes.values()))
+            cost = float(10.0 ** (np.floor(_power(first)) + 1))
+        return cls(both[:n], both[n:], cost, sizes.get("multiplier", 0.0))
 
-    def exact(self) -> Vector:
+    def exact_penalty_weights(self) -> Vector:
         """Slack weights just above the multipliers, to two digits, (n,): the least exact ones.
 
         Where no bound is active any positive ones are: a thousandth of κ/ρ_x.
         """
-        if not self.dearest:
+        if not self.largest_multiplier:
             return 1e-3 * self.cost / self.state
-        digit = 10.0 ** (np.floor(_power(self.dearest)) - 1)
-        return np.asarray((np.floor(self.dearest / digit) + 1) * digit / self.state)
+        digit = 10.0 ** (np.floor(_power(self.largest_multiplier)) - 1)
+        rounded_up = (np.floor(self.largest_multiplier / digit) + 1) * digit
+        return np.asarray(rounded_up / self.state)
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ class Scale:
     level: float
 
     @classmethod
-    def of(cls, problem: Problem) -> Scale:
+    def from_problem(cls, problem: Problem) -> Scale:
         """Scale of a problem: the widths between its bounds, and the size of its cost over them.
 
         A state's range is at most a hundred times the violation at which the penalty's quadratic
@@ -117,26 +121,21 @@ class Scale:
 def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
     """Sizes of the cost over steps `both` (n+m,) of (x, u), those that are not rounding, by name.
 
-    They are `dearest`, the largest multiplier of a state bound at the reference, `curved`, the
-    largest curvature, and `cost` itself; multipliers and curvatures of the economic cost. Raises
-    ModelError where the multipliers cannot be computed.
+    They are `multiplier`, the largest of a state bound at the reference, `curvature`, the largest
+    one, and `cost` itself; multipliers and curvatures of the economic cost. Raises ModelError where
+    the multipliers cannot be computed.
     """
-    model, n, reference = problem.model, problem.n_states, problem.reference
-    x, u, d, p = model.symbols()
-    w = ca.vertcat(x, u)
-    hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
-    rates = ca.jacobian(model.ode(x, u, d, p), w)
-    function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
-    nominal = (model.nominal_disturbance, model.nominal_parameters)
-    values = function(reference[:n], reference[n:], *nominal)
-    gradient, curvature = (value.full().reshape(-1) for value in values[:2])
-    rates = values[2].full()
-    near = ACTIVE * (problem.upper - problem.lower)
-    below, above = reference <= problem.lower + near, reference >= problem.upper - near
-    found = multipliers(gradient * both, rates * both, below, above)
+    n = problem.n_states
+    reference = problem.reference
+    gradient, curvature, rates = _derivatives_at_reference(problem)
+    near = ACTIVE_SHARE * (problem.upper - problem.lower)
+    below = reference <= problem.lower + near
+    above = reference >= problem.upper - near
+    bound_multipliers = multipliers(gradient * both, rates * both, below, above)
+    curved = np.nan_to_num(np.abs(curvature * both**2), posinf=0.0)
     sizes = {
-        "dearest": float(found[:n].max()),
-        "curved": float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max()),
+        "multiplier": float(bound_multipliers[:n].max()),
+        "curvature": float(curved.max()),
         "cost": abs(problem.reference_cost),
     }
     # A size below rounding counts as zero.
@@ -144,25 +143,54 @@ def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if size > least}
 
 
-def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
-    """|μ| (n+m,) of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs.
+def _derivatives_at_reference(problem: Problem) -> tuple[Vector, Vector, Matrix]:
+    """∇ℓ (n+m,), the diagonal of ∇²ℓ (n+m,), and ∂x' (n, n+m), by (x, u) at the reference."""
+    model = problem.model
+    x, u, d, p = model.symbols()
+    w = ca.vertcat(x, u)
+    hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
+    rates = ca.jacobian(model.ode(x, u, d, p), w)
+    function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
+    slope, curvature, jacobian = function(
+        problem.reference_state,
+        problem.reference_action,
+        model.nominal_disturbance,
+        model.nominal_parameters,
+    )
+    return slope.full().reshape(-1), curvature.full().reshape(-1), jacobian.full()
 
-    `gradient` is ∇ℓ (n+m,), `rates` ∂x' (n, n+m); `below` and `above` say which bounds are active.
-    They come from the QP min ½|w|² + ∇ℓᵀw under the equation and the active bounds. Raises
-    ModelError where DAQP finds none.
+
+def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
+    """|μ| of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs.
+
+    They come from the QP min ½|w|² + ∇ℓᵀw under the equation ∂x' w = 0 and the active bounds.
+
+    Args:
+        gradient: ∇ℓ, (n+m,).
+        rates: ∂x', (n, n+m).
+        below: Whether w is at its lower bound, (n+m,).
+        above: Whether w is at its upper bound, (n+m,).
+
+    Returns:
+        One a bound of (x, u), (n+m,); zero where it is not active.
+
+    Raises:
+        ModelError: DAQP finds none.
     """
     size = np.abs(gradient).max()
     if not size or not (np.isfinite(gradient).all() and np.isfinite(rates).all()):
         return np.zeros(gradient.size)
-    rows = rates / np.maximum(np.abs(rates).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    inequalities, equations = gradient.size, len(rates)
+    row_sizes = np.abs(rates).max(axis=1, keepdims=True)
+    rows = rates / np.maximum(row_sizes, np.finfo(np.float64).tiny)
+    bounds = gradient.size
+    equations = len(rates)
     _, _, flag, info = daqp.solve(
-        np.eye(inequalities),
+        np.eye(bounds),
         gradient / size,
         rows,
-        np.r_[np.where(above, 0.0, np.inf), np.zeros(equations)],
-        np.r_[np.where(below, 0.0, -np.inf), np.zeros(equations)],
-        np.repeat(np.array([0, DAQP_FIXED], dtype=np.int32), [inequalities, equations]),
+        np.concatenate([np.where(above, 0.0, np.inf), np.zeros(equations)]),
+        np.concatenate([np.where(below, 0.0, -np.inf), np.zeros(equations)]),
+        np.repeat(np.array([0, DAQP_FIXED], dtype=np.int32), [bounds, equations]),
         **DAQP_SETTINGS,
     )
     if flag <= 0:
@@ -170,7 +198,7 @@ def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Ve
             "problem: the multipliers of the bounds at the reference cannot be computed "
             f"({DAQP_STATUS.get(flag, flag)}); look at the derivatives of cost and model there"
         )
-    return np.asarray(np.abs(info["lam"][:inequalities]) * size)
+    return np.asarray(np.abs(info["lam"][:bounds]) * size)
 
 
 def _power(size: ArrayLike) -> Vector:
@@ -193,12 +221,34 @@ def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
 class Problem:
     """A discounted optimal control problem around a reference steady state.
 
-    `sampling_time` [s]; `horizon` N stages; `discount` γ ∈ (0, 1]; the bounds `state_lower` and
-    `state_upper` (n,), `action_lower` and `action_upper` (m,), and the reference `reference_state`
-    x_s (n,), `reference_action` u_s (m,), in the units of the model's quantities; `reference_cost`
-    ℓ_s. The penalty of a violation v ≥ 0 is Σ_i linear_i v_i + quadratic_i v_i² with
-    `penalty_linear` and `penalty_quadratic` (n,) (paper.tex, Simulations). `substeps` RK4 steps
-    make a sample of the model. Raises ModelError on sizes or values that do not fit.
+    The penalty of a violation v ≥ 0 is Σ_i linear_i v_i + quadratic_i v_i² (paper.tex,
+    Simulations). Bounds and reference are in the units of the model's quantities.
+
+    Args:
+        model: The controller's model.
+        sampling_time: Length of a sample in s.
+        horizon: Number of stages N.
+        discount: γ in (0, 1].
+        state_lower: Lower bounds of the states, (n,).
+        state_upper: Upper bounds of the states, (n,).
+        action_lower: Lower bounds of the actions, (m,).
+        action_upper: Upper bounds of the actions, (m,).
+        penalty_linear: Linear weights of a violation, (n,).
+        penalty_quadratic: Quadratic weights of a violation, (n,).
+        reference_state: x_s, (n,).
+        reference_action: u_s, (m,).
+        reference_cost: ℓ_s.
+        substeps: RK4 steps that make a sample of the model.
+
+    Raises:
+        ModelError: Sizes or values do not fit.
+
+    Example:
+        >>> problem = Problem.from_scenario(Scenario.load("paper"))
+        >>> problem.horizon, problem.discount
+        (10, 0.99)
+        >>> problem.state_lower
+        array([25., 40.])
     """
 
     model: Model
@@ -257,28 +307,30 @@ class Problem:
         )
         rate, rates, cost, slope = (value.full() for value in values)
         names = [quantity.name for quantity in (*model.states, *model.actions)]
-        found = [(f"ode(x, u, d, p): d/dt {names[i]}", rate[i, 0]) for i in range(n)]
-        found += [
-            (f"ode(x, u, d, p): the derivative of d/dt {names[i]} by {names[j]}", rates[i, j])
-            for i in range(n)
-            for j in range(len(names))
-        ]
-        found.append(("economic_cost(x, u, d, p): the cost", cost[0, 0]))
-        found += [
-            (f"economic_cost(x, u, d, p): the derivative of the cost by {name}", slope[0, j])
-            for j, name in enumerate(names)
-        ]
-        for what, value in found:
-            if not np.isfinite(value):
-                at = ", ".join(
-                    f"{name} = {float(at):g}"
-                    for name, at in zip(names, self.reference, strict=True)
-                )
-                raise ModelError(
-                    f"model '{model.name}', {what} is {value} at the reference ({at}), where the "
-                    "controller linearises first; give another reference_state and "
-                    "reference_action, or a smooth expression"
-                )
+        for i in range(n):
+            self._require_finite(f"ode(x, u, d, p): d/dt {names[i]}", rate[i, 0])
+        for i in range(n):
+            for j, name in enumerate(names):
+                what = f"ode(x, u, d, p): the derivative of d/dt {names[i]} by {name}"
+                self._require_finite(what, rates[i, j])
+        self._require_finite("economic_cost(x, u, d, p): the cost", cost[0, 0])
+        for j, name in enumerate(names):
+            what = f"economic_cost(x, u, d, p): the derivative of the cost by {name}"
+            self._require_finite(what, slope[0, j])
+
+    def _require_finite(self, what: str, value: float) -> None:
+        """Raise ModelError where a value of the model at the reference is not finite."""
+        if np.isfinite(value):
+            return
+        model = self.model
+        point = []
+        for quantity, entry in zip((*model.states, *model.actions), self.reference, strict=True):
+            point.append(f"{quantity.name} = {float(entry):g}")
+        raise ModelError(
+            f"model '{model.name}', {what} is {value} at the reference ({', '.join(point)}), "
+            "where the controller linearises first; give another reference_state and "
+            "reference_action, or a smooth expression"
+        )
 
     @property
     def n_states(self) -> int:
@@ -329,12 +381,12 @@ class Problem:
     @cached_property
     def units(self) -> Units:
         """Orders of magnitude of states, actions and cost."""
-        return Units.of(self)
+        return Units.from_problem(self)
 
     @cached_property
     def scale(self) -> Scale:
         """What the controller's QP is scaled by."""
-        return Scale.of(self)
+        return Scale.from_problem(self)
 
     def value_level(self, discount: float | None = None) -> float:
         """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.
@@ -353,7 +405,14 @@ class Problem:
             sampling_time=scenario.sampling_time,
             horizon=settings.horizon,
             discount=scenario.discount,
-            **{name: getattr(scenario, name) for name in VECTORS},
+            state_lower=np.asarray(scenario.state_lower),
+            state_upper=np.asarray(scenario.state_upper),
+            action_lower=np.asarray(scenario.action_lower),
+            action_upper=np.asarray(scenario.action_upper),
+            penalty_linear=np.asarray(scenario.penalty_linear),
+            penalty_quadratic=np.asarray(scenario.penalty_quadratic),
+            reference_state=np.asarray(scenario.reference_state),
+            reference_action=np.asarray(scenario.reference_action),
             reference_cost=settings.reference_cost,
             substeps=settings.substeps,
         )
@@ -391,7 +450,15 @@ class DisturbanceLaw:
     ranges: Vector
 
     def draw(self, generator: np.random.Generator, count: int) -> Matrix:
-        """Draw `count` independent disturbances, shape (count, n_d)."""
+        """Draw independent disturbances.
+
+        Args:
+            generator: What draws.
+            count: How many are drawn.
+
+        Returns:
+            Disturbances in the model's units, (count, n_d).
+        """
         size = (count, len(self.nominal))
         if self.kind == "uniform":
             return self.nominal + self.ranges * generator.uniform(-1.0, 1.0, size)
@@ -400,7 +467,7 @@ class DisturbanceLaw:
         return np.tile(self.nominal, (count, 1))
 
 
-MEND = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
+NAME_THE_MODEL = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
 
 
 @dataclass(frozen=True)
@@ -419,17 +486,21 @@ class PlantProblem:
         not fit the plant, ModelError where it cannot be loaded.
         """
         problem = Problem.from_scenario(scenario)
-        plant, table = scenario.plant, scenario.disturbance
+        plant = scenario.plant
+        table = scenario.disturbance
         if plant.model is not None:
             problem = replace(problem, model=load_model(plant.model))
-        model, needed = problem.model, "the optimum needs a model of the plant"
+        model = problem.model
+        needed = "the optimum needs a model of the plant"
         for kind in ("states", "actions", "disturbances"):
             ours = [quantity.name for quantity in getattr(model, kind)]
-            if ours != (theirs := list(getattr(plant, kind))):
+            theirs = list(getattr(plant, kind))
+            if ours != theirs:
                 raise OptimumError(
                     f"{needed}: model '{model.name}' has the {kind} {', '.join(ours)}, the plant "
-                    f"{', '.join(theirs)}; {MEND}"
+                    f"{', '.join(theirs)}; {NAME_THE_MODEL}"
                 )
+        # What the scenario does not say is the model's: its nominal disturbances, without noise.
         nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
         ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
         parameters = {quantity.name: quantity.nominal for quantity in model.parameters}
@@ -437,8 +508,8 @@ class PlantProblem:
             if name not in parameters:
                 raise OptimumError(
                     f"{needed}: plant.parameters sets '{name}', which model '{model.name}' does "
-                    f"not have: give the model that parameter, {MEND}, or, where it only shapes "
-                    "the noise, name it in plant.mapping.ranges and set disturbance.ranges"
+                    f"not have: give the model that parameter, {NAME_THE_MODEL}, or, where it only "
+                    "shapes the noise, name it in plant.mapping.ranges and set disturbance.ranges"
                 )
             parameters[name] = value
         law = DisturbanceLaw(table.law, nominal, ranges)

@@ -9,19 +9,26 @@ from controllers.model import Model, Quantity
 
 def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     """Rates of concentration and temperature per minute."""
+    cA, T = ca.vertsplit(x)
+    q, Tc = ca.vertsplit(u)
+    cAf, Tf = ca.vertsplit(d)
     V, k0, E, heat, UA, *_ = ca.vertsplit(p)
-    rate = k0 * ca.exp(-E / x[1]) * x[0]
+    rate = k0 * ca.exp(-E / T) * cA
     return ca.vertcat(
-        u[0] / V * (d[0] - x[0]) - rate, u[0] / V * (d[1] - x[1]) + heat * rate + UA * (u[1] - x[1])
+        q / V * (cAf - cA) - rate,
+        q / V * (Tf - T) + heat * rate + UA * (Tc - T),
     )
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     """Feed, pumping and cooling less the product, per minute."""
+    cA, _ = ca.vertsplit(x)
+    q, Tc = ca.vertsplit(u)
+    cAf, Tf = ca.vertsplit(d)
     feed, pump, cooling, fixed = ca.vertsplit(p[5:])
-    product = u[0] * (d[0] - x[0])
-    quadratic = pump * u[0] ** 2 + cooling * (d[1] - u[1]) ** 2
-    return fixed + feed * u[0] * d[0] - product + quadratic
+    product = q * (cAf - cA)
+    quadratic = pump * q**2 + cooling * (Tf - Tc) ** 2
+    return fixed + feed * q * cAf - product + quadratic
 
 
 def model() -> Model:

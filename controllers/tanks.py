@@ -11,10 +11,13 @@ GRAVITY = 981.0  # cm/s²
 
 def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     """Rates of the four levels per second; `d` is the water drawn from the lower tanks."""
-    areas, holes = p[:4], p[4:8]
+    areas = p[:4]
+    holes = p[4:8]
     k1, k2, split1, split2 = ca.vertsplit(p[8:])
+    # Torricelli's law; the least level keeps the root differentiable in an empty tank.
     out = holes * ca.sqrt(2 * GRAVITY * ca.fmax(x, 1e-3))
-    pump1, pump2 = k1 * u[0], k2 * u[1]
+    pump1 = k1 * u[0]
+    pump2 = k2 * u[1]
     inflow = ca.vertcat(
         out[2] + split1 * pump1 - d[0],
         out[3] + split2 * pump2 - d[1],
@@ -24,23 +27,39 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     return (inflow - out) / areas
 
 
+def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
+    """The squares of the pumps' voltages."""
+    return u[0] ** 2 + u[1] ** 2
+
+
 def model() -> Model:
     """Four tanks, two pumps, each of which feeds a lower and an upper tank; time in seconds."""
     return Model(
         name="tanks",
-        states=tuple(Quantity(f"h{i}", "cm", 10.0) for i in (1, 2, 3, 4)),
+        states=(
+            Quantity("h1", "cm", 10.0),
+            Quantity("h2", "cm", 10.0),
+            Quantity("h3", "cm", 10.0),
+            Quantity("h4", "cm", 10.0),
+        ),
         actions=(Quantity("v1", "V", 3.0), Quantity("v2", "V", 3.0)),
         disturbances=(Quantity("d1", "cm3/s", 3.0), Quantity("d2", "cm3/s", 3.0)),
         parameters=(
-            *(Quantity(f"A{i}", "cm2", 28.0 if i % 2 else 32.0) for i in (1, 2, 3, 4)),
-            *(Quantity(f"a{i}", "cm2", 0.071 if i % 2 else 0.057) for i in (1, 2, 3, 4)),
+            Quantity("A1", "cm2", 28.0),
+            Quantity("A2", "cm2", 32.0),
+            Quantity("A3", "cm2", 28.0),
+            Quantity("A4", "cm2", 32.0),
+            Quantity("a1", "cm2", 0.071),
+            Quantity("a2", "cm2", 0.057),
+            Quantity("a3", "cm2", 0.071),
+            Quantity("a4", "cm2", 0.057),
             Quantity("k1", "cm3/(V.s)", 3.33),
             Quantity("k2", "cm3/(V.s)", 3.35),
             Quantity("split1", "1", 0.70),
             Quantity("split2", "1", 0.60),
         ),
         ode=_ode,
-        economic_cost=lambda x, u, d, p: u[0] ** 2 + u[1] ** 2,
+        economic_cost=_economic_cost,
         time_unit=1.0,
         uncertain=("k1", "k2"),  # pumps wear
     )

@@ -34,7 +34,15 @@ def upper_triangle(dimension: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def symmetric_matrix(packed: Vector, dimension: int) -> Vector:
-    """Symmetric matrix (d, d) from the packed entries of its upper triangle."""
+    """Symmetric matrix from the packed entries of its upper triangle.
+
+    Args:
+        packed: The entries row by row, (d(d+1)/2,).
+        dimension: Number of rows d.
+
+    Returns:
+        The matrix, (d, d).
+    """
     matrix = np.empty((dimension, dimension))
     rows, columns = upper_triangle(dimension)
     matrix[rows, columns] = matrix[columns, rows] = packed
@@ -123,7 +131,10 @@ class ThetaBlocks:
             if block.symmetric:
                 pairs = zip(*upper_triangle(block.shape[0]), strict=True)
                 entries = (f"{i},{j}" for i, j in pairs)
-            names += [f"{block.name}[{entry}]" if block.shape else block.name for entry in entries]
+            if block.shape:
+                names += [f"{block.name}[{entry}]" for entry in entries]
+            else:
+                names.append(block.name)
         return tuple(names)
 
     def __iter__(self) -> Iterator[ThetaBlock]:
@@ -140,7 +151,7 @@ class ThetaBlocks:
         raise ParameterError(f"θ has no block '{name}'{instead(name, self.slices)}")
 
     @classmethod
-    def of(
+    def from_problem(
         cls,
         problem: Problem,
         *,
@@ -149,39 +160,57 @@ class ThetaBlocks:
     ) -> ThetaBlocks:
         """Blocks of the paper's θ for a problem (paper.tex, Simulations), and optional ones.
 
-        `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
-        predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
         Scales are made of the problem's `Units` ρ and κ: a Hessian's is κ/ρ_iρ_j, a gradient's
-        0.1 κ/ρ, a bound's ρ/100, those of the slack weights κ/ρ and 1000 κ/ρ². Raises ModelError on
-        a parameter that the model lacks.
+        0.1 κ/ρ, a bound's ρ/100, those of the slack weights κ/ρ and 1000 κ/ρ².
+
+        Args:
+            problem: The control problem.
+            slack_weights: Whether to add the linear and quadratic slack weights w_sigma and W_sigma
+                of the predicted stages 1…N.
+            model_parameters: Physical parameters of the model that are to be a block p, by name.
+
+        Raises:
+            ModelError: The model has no such parameter.
         """
         units = problem.units
-        kappa, states = units.cost, units.state
+        kappa = units.cost
+        states = units.state
         both = np.concatenate([states, units.action])
+        state_hessian = kappa / np.outer(states, states)
+        hessian = kappa / np.outer(both, both)
 
         def block(name: str, scale: Vector, meaning: str, least: ArrayLike = ()) -> ThetaBlock:
             packed = scale[upper_triangle(len(scale))] if scale.ndim == 2 else scale.reshape(-1)
             smallest = tuple(np.asarray(least).tolist())
             return ThetaBlock(name, scale.shape, tuple(packed.tolist()), meaning, least=smallest)
 
-        of_states, of_both = (kappa / np.outer(sizes, sizes) for sizes in (states, both))
         blocks = [
-            block("B_lambda", of_states, "initial cost, quadratic"),
+            block("B_lambda", state_hessian, "initial cost, quadratic"),
             block("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
             block("c_lambda", np.array(0.1 * kappa), "initial cost, constant"),
-            block("B_Vf", of_states, "terminal cost, quadratic"),
+            block("B_Vf", state_hessian, "terminal cost, quadratic"),
             block("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
-            block("B_l", of_both, "stage cost, quadratic"),
+            block("B_l", hessian, "stage cost, quadratic"),
             block("b_l", 0.1 * kappa / both, "stage cost, linear"),
             block("c_f", 0.001 * states, "model offset"),
             block("x_l", 0.01 * states, "lower state bound"),
             block("x_u", 0.01 * states, "upper state bound"),
         ]
         if slack_weights:
-            linear, quadratic, meaning = kappa / states, kappa / states**2, "slack of stages 1…N"
+            quadratic = kappa / states**2
             blocks += [
-                block("w_sigma", linear, f"{meaning}, linear weight", units.exact()),
-                block("W_sigma", 1e3 * quadratic, f"{meaning}, quadratic weight", quadratic),
+                block(
+                    "w_sigma",
+                    kappa / states,
+                    "slack of stages 1…N, linear weight",
+                    units.exact_penalty_weights(),
+                ),
+                block(
+                    "W_sigma",
+                    1e3 * quadratic,
+                    "slack of stages 1…N, quadratic weight",
+                    quadratic,
+                ),
             ]
         if model_parameters:
             indices = problem.model.parameter_indices(model_parameters)
@@ -203,6 +232,12 @@ class Parameters(Shown):
     """A value `theta` of θ, (blocks.size,), with its blocks; `parameters["B_l"]` is a whole block.
 
     Raises ParameterError on a vector of wrong length or with an entry that is not finite.
+
+    Example:
+        >>> problem = Problem.from_scenario(Scenario.load("paper"))
+        >>> parameters = Parameters.naive(problem)
+        >>> parameters.replace({"x_l": [25.1, 41.0]})["x_l"]
+        array([25.1, 41. ])
     """
 
     blocks: ThetaBlocks
@@ -222,7 +257,11 @@ class Parameters(Shown):
         return self.blocks.block(name).unpack(self.theta[self.blocks.slices[name]])
 
     def _facts(self) -> dict[str, object]:
-        return {"hash": self.hash, "blocks": ", ".join(self.blocks.slices), "size": len(self.theta)}
+        return {
+            "hash": self.hash,
+            "blocks": ", ".join(self.blocks.slices),
+            "size": len(self.theta),
+        }
 
     def to_pandas(self) -> Any:
         """The entries of θ by their labels, with their learning scales, as a pandas data frame."""
@@ -261,7 +300,8 @@ class Parameters(Shown):
     @property
     def hash(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of names and exact values."""
-        content = json.dumps([list(self.blocks.labels), [float(v).hex() for v in self.theta]])
+        values = [float(value).hex() for value in self.theta]
+        content = json.dumps([list(self.blocks.labels), values])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     @classmethod
@@ -269,8 +309,12 @@ class Parameters(Shown):
         """The paper's naive guess: B_l = I, B_Vf = I, c_lambda = ℓ_s, true bounds, else 0.
 
         Slack weights in θ start at the true penalty, model parameters at their nominal values.
+
+        Args:
+            problem: The control problem.
+            blocks: The blocks of θ; the paper's where they are None.
         """
-        blocks = blocks or ThetaBlocks.of(problem)
+        blocks = blocks or ThetaBlocks.from_problem(problem)
         values: dict[str, ArrayLike] = {
             "B_l": np.eye(problem.n_states + problem.n_actions),
             "B_Vf": np.eye(problem.n_states),
@@ -300,24 +344,39 @@ class Parameters(Shown):
 
     @classmethod
     def load(cls, path: str | Path, problem: Problem) -> Parameters:
-        """Read θ for a problem; the file says which optional blocks it has.
+        """Read θ from a file, which says which optional blocks it has.
 
-        Raises ParameterError where the file is missing or no TOML, has another schema, key or
-        block, or values that do not match its hash.
+        Args:
+            path: The θ file.
+            problem: The control problem.
+
+        Raises:
+            ParameterError: The file is missing or no TOML, has another schema, key or block, or
+                values that do not match its hash.
         """
         text = read_text(path, f"parameters file '{path}'", ParameterError)
         return cls.from_toml(text, problem, path)
 
     @classmethod
     def from_toml(cls, text: str, problem: Problem, path: str | Path) -> Parameters:
-        """θ of a file's text, as `load`; `path` names the file in messages."""
+        """Read θ from a file's text, as `load` does.
+
+        Args:
+            text: Text of the θ file.
+            problem: The control problem.
+            path: What the file is called in messages.
+        """
         origin = f"parameters file '{path}'"
         document = parse_toml(text, origin, ParameterError)
         file = validated(_File, document, origin, ParameterError)
-        values, names = file.theta, file.model_parameters
+        values = file.theta
         slack_weights = "w_sigma" in values or "W_sigma" in values
         try:
-            blocks = ThetaBlocks.of(problem, slack_weights=slack_weights, model_parameters=names)
+            blocks = ThetaBlocks.from_problem(
+                problem,
+                slack_weights=slack_weights,
+                model_parameters=file.model_parameters,
+            )
             missing = [name for name in blocks.slices if name not in values]
             unknown = [name for name in values if name not in blocks]
             if missing or unknown:
@@ -343,12 +402,17 @@ def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
     """Symbol `theta` (n_θ,), its blocks by name, and `model_parameters` (n_p,) with θ's own in it.
 
     A slack weight that is no block is the problem's constant.
+
+    Args:
+        problem: The control problem.
+        blocks: The blocks of θ.
     """
     theta = ca.SX.sym("theta", blocks.size)
     symbols = {"theta": theta}
     for block in blocks:
         part = theta[blocks.slices[block.name]]
         if block.symmetric:
+            # Where each of the matrix's entries is among the packed ones.
             place = block.unpack(np.arange(float(block.size))).astype(int)
             part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
         symbols[block.name] = part
@@ -356,6 +420,7 @@ def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
     symbols.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
     parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
     if "p" in blocks:
-        for i, index in enumerate(problem.model.parameter_indices(blocks.block("p").labels)):
+        indices = problem.model.parameter_indices(blocks.block("p").labels)
+        for i, index in enumerate(indices):
             parameters[index] = symbols["p"][i]
     return symbols | {"model_parameters": parameters}

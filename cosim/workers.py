@@ -96,14 +96,14 @@ class Conditions:
         names = changed(self.facts, facts)
         if not names:
             return None
-        seen = []
+        differences = []
         for name in names:
-            seen.append(f"{name} ({facts.get(name)}, not {self.facts.get(name)})")
+            differences.append(f"{name} ({facts.get(name)}, not {self.facts.get(name)})")
         if "fmu" in names:
-            seen.append(f"the FMU is '{self.scenario.plant.fmu}'")
+            differences.append(f"the FMU is '{self.scenario.plant.fmu}'")
         message = (
             "EvaluationError: a worker ran with other things than the work was planned with: "
-            f"{'; '.join(seen)}; give the command again with the same everywhere"
+            f"{'; '.join(differences)}; give the command again with the same everywhere"
         )
         return Failure(message, f"{message}\n", EvaluationError)
 
@@ -177,19 +177,20 @@ def done(
         EvaluationError: no worker can work.
     """
     jobs = whole_number("jobs", jobs, 1, EvaluationError)
-    left = dict(items)
+    remaining = dict(items)
     fruitless = 0
-    while left:
+    while remaining:
         fruitless += 1
         try:
-            with closing(_reports(left, jobs, scheduler)) as reports:
+            with closing(_reports(remaining, jobs, scheduler)) as reports:
                 for key, report in reports:
-                    conditions = left.pop(key).conditions
+                    conditions = remaining.pop(key).conditions
                     fruitless = 0
                     if isinstance(report.result, Failure):
                         yield key, report.result
                     else:
                         yield key, conditions.refusal(report.facts) or report.result
+        # A worker was killed, for want of memory say: what it left is given out again.
         except BrokenProcessPool as error:
             if fruitless == ROUNDS:
                 raise EvaluationError(
@@ -200,6 +201,7 @@ def done(
 
 def begin(parent: int) -> None:
     """Leave Ctrl-C to the parent, and end with it."""
+    # Python sets a handler in the main thread alone.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     follow_parent(parent)

@@ -26,10 +26,13 @@ def path(name: str = "evaporator") -> Path:
 
 @dataclass(frozen=True)
 class Platform:
-    """A platform by its FMI 3.0 tuple.
+    """A platform.
 
-    Its folder under ``binaries/`` in FMI 2.0, the suffix of shared libraries there, and the target
-    by which the cross-compiler knows it.
+    Attributes:
+        tuple: FMI 3.0's, which names its folder under ``binaries/``.
+        fmi2_folder: its folder in FMI 2.0.
+        suffix: of shared libraries there.
+        target: by which the cross-compiler knows it.
     """
 
     tuple: str
@@ -79,7 +82,8 @@ def platforms_of(library: bytes) -> tuple[str, ...]:
         if library[:2] == b"MZ":
             return _pe_platform(library)
         return _mach_o_platforms(library)
-    except (struct.error, IndexError):  # the file ends within its header
+    # The file ends within its header.
+    except (struct.error, IndexError):
         return ()
 
 

@@ -129,12 +129,15 @@ def unit(name: str) -> Unit:
     stands alone.
     """
     unknown = Unit(name, exponents=None)
+    # A unit that is not understood is written by its name alone, which FMI allows.
     if not _QUOTIENT.fullmatch(name):
         return unknown
+    # Fractions: a product of floats would depend on the order of its terms.
     factor = Fraction(1)
     exponents = dict.fromkeys(_BASE, 0)
     for position, part in enumerate(name.split("/")):
-        sign = -1 if position else 1  # numerator first
+        # The numerator first.
+        sign = -1 if position else 1
         symbols = part.strip("()").split(".") if part else []
         for symbol in symbols:
             match = _POWER.fullmatch(symbol)
@@ -154,16 +157,25 @@ def unit(name: str) -> Unit:
 class FmuModel:
     """A model: its name, C identifier, table of variables, interfaces and C sources.
 
-    A variable's value reference is its position in the table. `step_size` [s] is that of the
-    default experiment, of 100 steps; `model_exchange` and `derivatives` (directional) say what it
-    offers beside co-simulation. Where it is `sampled`, it acts at the multiples of `step_size`
-    alone: its outputs are discrete, and no communication step may pass over a sample.
-    Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
-    variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
-    names. `units` gives the order of the variables' units where it shall not be the table's own.
-    `sources` are its own C headers by file name; a sampled model's ``core.h`` defines the functions
-    that ``sampled_sources/model_state.h`` lists, with arrays in the order of the table. `origin`
-    tells in generated C where it comes from.
+    A variable's value reference is its position in the table.
+
+    Attributes:
+        name: of the model.
+        identifier: the same in C.
+        description: in words.
+        variables: the table.
+        step_size: of the default experiment, of 100 steps, in s.
+        model_exchange: whether it offers that beside co-simulation.
+        derivatives: whether it has directional ones.
+        sampled: whether it acts at the multiples of `step_size` alone: its outputs are discrete,
+            and no communication step may pass over a sample. Its reals ``NAME[…]`` are one array
+            NAME in FMI 3.0.
+        terminal: variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect
+            by their names.
+        units: order of the variables' units where it shall not be the table's own.
+        sources: its own C headers by file name; a sampled model's ``core.h`` defines the functions
+            that ``sampled_sources/model_state.h`` lists, with arrays in the order of the table.
+        origin: tells in generated C where it comes from.
     """
 
     name: str
@@ -434,6 +446,7 @@ def _real_attributes(
     variable: Variable,
     model: FmuModel,
 ) -> Attributes:
+    # In the order in which the description has them.
     attributes: dict[str, object] = {"unit": variable.unit or None}
     for key in ("min", "max", "nominal", "start"):
         value = getattr(variable, key)
@@ -443,7 +456,8 @@ def _real_attributes(
         attributes[key] = float(value)
     if variable.start is not None and variable.name in model.arrays:
         elements = model.arrays[variable.name]
-        attributes["start"] = " ".join(str(float(v.start or 0.0)) for v in elements)
+        starts = [str(float(element.start or 0.0)) for element in elements]
+        attributes["start"] = " ".join(starts)
     if variable.kind is Kind.DERIVATIVE:
         state = variable.name.removeprefix("der(").removesuffix(")")
         attributes["derivative"] = _numbering(version, model)(state)
@@ -458,6 +472,7 @@ def _numbering(version: FmiVersion, model: FmuModel) -> Callable[[str], int]:
     if version == 3:
         return model.value_reference
     names = [variable.name for variable in model.exported(2)]
+    # FMI 2.0 counts what the description shows, not the table.
     return lambda name: names.index(name) + 1
 
 

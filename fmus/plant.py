@@ -24,10 +24,16 @@ _SHARED = (
 
 @dataclass(frozen=True)
 class Signal:
-    """A variable of a plant: its `name`, unit, value at the start, `min`, `max`, `description`.
+    """A variable of a plant.
 
-    `start` is a state's initial value, an input's or parameter's default, a disturbance's mean;
-    outputs have none. `range` is a disturbance's half width (uniform) or standard deviation.
+    Attributes:
+        name: of the variable.
+        unit: as FMI writes it.
+        start: a state's initial value, an input's or parameter's default, a disturbance's mean;
+            outputs have none.
+        min, max: its range.
+        description: in words.
+        range: a disturbance's half width (uniform) or standard deviation.
     """
 
     name: str
@@ -92,6 +98,7 @@ def plant_model(
     Returns:
         The model; `build_plant` makes its FMU.
     """
+    # What the equations may use: who wrote them is not asked which of these they do.
     known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
     switches = _switches(sampling_time)
     draws = tuple(v.name for v in switches if v.name != "saturate")
@@ -99,8 +106,15 @@ def plant_model(
     for state in states:
         table.append(state.variable(Kind.STATE, uses=(f"{state.name}_start",)))
     for state in states:
-        about = f"time derivative of {state.name}"
-        rate = Signal(f"der({state.name})", f"{state.unit}/s", state.start, -1e6, 1e6, about)
+        description_of_rate = f"time derivative of {state.name}"
+        rate = Signal(
+            f"der({state.name})",
+            f"{state.unit}/s",
+            start=state.start,
+            min=-1e6,
+            max=1e6,
+            description=description_of_rate,
+        )
         table.append(rate.variable(Kind.DERIVATIVE, uses=known))
     for signal in inputs:
         table.append(signal.variable(Kind.INPUT))
@@ -113,8 +127,11 @@ def plant_model(
     for disturbance in disturbances:
         table += _law_of(disturbance)
     for state in states:
-        about = f"{state.name} at the start"
-        start = replace(state, name=f"{state.name}_start", description=about)
+        start = replace(
+            state,
+            name=f"{state.name}_start",
+            description=f"{state.name} at the start",
+        )
         table.append(start.variable(Kind.FIXED))
     for parameter in parameters:
         table.append(parameter.variable(Kind.TUNABLE))
@@ -145,8 +162,14 @@ def _law_of(disturbance: Signal) -> tuple[Variable, Variable]:
         disturbance, name=f"{name}_nominal", description=f"mean {disturbance.description}"
     )
     widest = disturbance.max - disturbance.min
-    about = "half width (uniform) or standard deviation (normal)"
-    spread = Signal(f"{name}_range", disturbance.unit, disturbance.range, 0.0, widest, about)
+    spread = Signal(
+        f"{name}_range",
+        disturbance.unit,
+        start=disturbance.range,
+        min=0.0,
+        max=widest,
+        description="half width (uniform) or standard deviation (normal)",
+    )
     return mean.variable(Kind.TUNABLE), spread.variable(Kind.TUNABLE)
 
 

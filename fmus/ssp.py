@@ -60,6 +60,7 @@ def write_ssp(
         versions.add(version)
         members[f"resources/{name}.fmu"] = fmu.read_bytes()
         known = _base_units(description)
+        # SSP describes each unit that a connector names.
         unit_of = {v.name: v.unit for v in description.modelVariables if v.unit in known}
         connectors = []
         for kind, names in (("input", inputs), ("output", outputs)):

@@ -308,7 +308,7 @@ def starting_parameters(
     for name in configuration.learned_parameters(problem.model):
         if name not in labels:
             labels.append(name)
-    blocks = ThetaBlocks.of(
+    blocks = ThetaBlocks.from_problem(
         problem,
         slack_weights=configuration.parametrisation == "extended",
         model_parameters=tuple(labels),

@@ -42,7 +42,9 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
     problem = replace(found.problem, model=found.problem.model.measuring(measured))
     given = found.parameters.blocks
     names = (*(given.block("p").labels if "p" in given else ()), *measured)
-    blocks = ThetaBlocks.of(problem, slack_weights="w_sigma" in given, model_parameters=names)
+    blocks = ThetaBlocks.from_problem(
+        problem, slack_weights="w_sigma" in given, model_parameters=names
+    )
     return RtiNmpc(problem, found.parameters.placed_in(Parameters.naive(problem, blocks)))
 
 

@@ -103,7 +103,7 @@ def check_fmu(
                 raise
             found = PlantCheck(path, False, f"it cannot be a plant: {error}", ())
         header = ("checked", "found", "what follows")
-        rows = [(row.subject, row.found, row.consequence) for row in found.rows]
+        rows = [(row.subject, row.finding, row.consequence) for row in found.rows]
         if rows:
             out_.table(str(found.fmu), header, rows)
         if found.remarks:

@@ -145,12 +145,12 @@ class ClosedLoop:
         action = self.solution.action
         # NumPy would spread a number over all inputs, and take truth for one.
         if not isinstance(action, np.ndarray) or action.dtype.kind not in "fiu":
-            given = f"{type(action).__name__} {action}"
+            description = f"{type(action).__name__} {action}"
         elif action.shape != self.lower.shape:
-            given = f"shape {action.shape}"
+            description = f"shape {action.shape}"
         else:
             return self.saturate(action)
-        raise self.wrong(f"an action of {given}, not {self.lower.shape}", number=self.number)
+        raise self.wrong(f"an action of {description}, not {self.lower.shape}", number=self.number)
 
     def saturate(self, action: Array) -> Array:
         """An action (m,) within the actuators' bounds: the QP keeps them to its tolerance only."""
@@ -182,15 +182,15 @@ class ClosedLoop:
         self.number += 1
         return sample
 
-    def wrong(self, given: str, number: int | None = None) -> CosimError:
+    def wrong(self, answer: str, number: int | None = None) -> CosimError:
         """An error that names the controller.
 
         Args:
-            given: what the controller gave, in words.
+            answer: what the controller gave, in words.
             number: of the sample; None where it does not matter.
         """
         where = "" if number is None else f", at step {number}"
-        return CosimError(f"{controller_name(self._controller)} gave {given}{where}")
+        return CosimError(f"{controller_name(self._controller)} gave {answer}{where}")
 
     def _check_solution(self) -> None:
         """Raise CosimError where a foreign controller's solution lacks an action or a status."""

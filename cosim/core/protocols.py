@@ -20,9 +20,13 @@ Matrix = Array
 class Step(NamedTuple):
     """One sample of the plant: from x_k under u_k and d_k to x_{k+1}.
 
-    `s` (n,) is x_{k+1}; `stage_cost` is ℓ(x_k, u_k, d_k) without penalty; `penalty` is that of
-    x_k at the scenario's true bounds; `disturbance` (p,) is d_k. The cost per sample that
-    J averages is `stage_cost + penalty`.
+    The cost per sample that J averages is `stage_cost + penalty`.
+
+    Attributes:
+        s: x_{k+1}, (n,).
+        stage_cost: ℓ(x_k, u_k, d_k), without penalty.
+        penalty: that of x_k at the scenario's true bounds.
+        disturbance: d_k, (p,).
     """
 
     s: Array

@@ -617,13 +617,16 @@ def nearest_steady_state(
     Raises:
         PlantError: There is no steady state near the start.
     """
+    # A plant that cannot start elsewhere cannot be searched.
     if not plant.scenario.plant.mapping.initial_state:
-        return plant.reset(0), action, plant.step(action).stage_cost
+        state = plant.reset(0)
+        return state, action, plant.step(action).stage_cost
     n = len(state)
     low, high = plant.state_range
     lower = np.concatenate([low, plant.scenario.action_lower])
     upper = np.concatenate([high, plant.scenario.action_upper])
     start = np.concatenate([state, action])
+    # A variable that starts at zero has a scale, too.
     scale: Array = np.maximum(np.abs(start), 1e-2)
 
     def residual(z: Array) -> Array:
@@ -636,11 +639,11 @@ def nearest_steady_state(
     with np.errstate(divide="ignore", invalid="ignore"):
         result = least_squares(residual, start, "3-point", (lower, upper), x_scale=scale, **precise)
     z = result.x
-    left = float(np.max(np.abs(result.fun)))
-    if left > LOOSE:
+    residual_left = float(np.max(np.abs(result.fun)))
+    if residual_left > LOOSE:
         raise PlantError(
             f"FMU '{plant.fmu_path.name}' has no steady state near its start values (a sample "
-            f"still moves a state by {left:.2g} of its scale); give other start "
+            f"still moves a state by {residual_left:.2g} of its scale); give other start "
             "values by --state and --action"
         )
     plant.reset(0, z[:n])

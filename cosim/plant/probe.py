@@ -65,7 +65,7 @@ class Row:
     """A line of a report: what was asked, what was seen, and what follows for the plant."""
 
     subject: str
-    found: str
+    finding: str
     consequence: str
 
 

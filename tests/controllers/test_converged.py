@@ -20,7 +20,7 @@ WHOLE = {"all": slice(None)}
 
 @pytest.fixture(scope="module")
 def blocks():
-    return ThetaBlocks.of(evaporator_problem(), slack_weights=True)
+    return ThetaBlocks.from_problem(evaporator_problem(), slack_weights=True)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def converged(blocks):
 @pytest.fixture(scope="module")
 def physical():
     problem = evaporator_problem()
-    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
+    blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=("UA2", "h"))
     return ConvergedNmpc(problem, Parameters.naive(problem, blocks), tolerance=1e-10)
 
 

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.errors import ModelError, ModelWarning
-from controllers.integration import TOLERANCE, measure_integration
+from controllers.integration import INTEGRATION_TOLERANCE, measure_integration
 from cosim.core.scenario import Scenario
 from tests.helpers.models import make_model, make_problem
 
@@ -54,7 +54,7 @@ def judge_fast_state(rate):
     if abs(growth) > 1.001:
         with pytest.raises(ModelError, match=f"substeps = {measure_integration(problem).suffices}"):
             build()
-    elif abs(growth**2 - np.exp(-rate)) > 3 * TOLERANCE:
+    elif abs(growth**2 - np.exp(-rate)) > 3 * INTEGRATION_TOLERANCE:
         with warnings.catch_warnings(record=True) as shown:
             warnings.simplefilter("always")
             build()
@@ -67,7 +67,7 @@ def judge_fast_state(rate):
     controller = RtiNmpc(mended, Parameters.naive(mended))
     controller.prepare()
     found = controller.feedback([0.0, 0.0]).prepared.part("A").reshape(-1, 2, 2)[0]
-    np.testing.assert_allclose(found, exact, atol=TOLERANCE)
+    np.testing.assert_allclose(found, exact, atol=INTEGRATION_TOLERANCE)
 
 
 def test_an_unstable_plant_is_not_called_stiff():

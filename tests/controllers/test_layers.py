@@ -24,7 +24,7 @@ def case(request, monkeypatch):
     monkeypatch.delenv("COSIM_COMPILE", raising=False)
     monkeypatch.setattr(functions, "FLAGS", ("-O0", *functions.FLAGS[1:]))  # as in test_engine
     problem, rng = evaporator_problem(), np.random.default_rng(3)
-    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2",))
+    blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=("UA2",))
     controller = RtiNmpc(problem, random_parameters(problem, blocks, rng))
     if request.param == "compiled":
         controller.compile()

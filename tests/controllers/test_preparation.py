@@ -14,7 +14,9 @@ N, n, m = 10, 2, 2
 
 @pytest.fixture(scope="module")
 def blocks():
-    return ThetaBlocks.of(evaporator_problem(), slack_weights=True, model_parameters=("UA2", "h"))
+    return ThetaBlocks.from_problem(
+        evaporator_problem(), slack_weights=True, model_parameters=("UA2", "h")
+    )
 
 
 @pytest.fixture(scope="module")

@@ -58,12 +58,12 @@ def test_the_evaporators_units_are_the_numbers_that_the_stored_results_were_lear
     units = Problem.from_scenario(Scenario.load(preset)).units
     assert units.state.tolist() == [100.0, 100.0] and units.action.tolist() == [100.0, 100.0]
     assert units.cost == 1e4
-    assert units.exact().tolist() == [61.0, 61.0]
+    assert units.exact_penalty_weights().tolist() == [61.0, 61.0]
 
 
-def test_the_dearest_multiplier_is_the_optimal_steady_states(problem):
+def test_the_largest_multiplier_is_the_optimal_steady_states(problem):
     by_ipopt = optimal_steady_state(problem).multipliers[:2] * problem.units.state
-    assert problem.units.dearest == pytest.approx(by_ipopt.max())
+    assert problem.units.largest_multiplier == pytest.approx(by_ipopt.max())
 
 
 def test_other_decimal_units_change_the_units_alone():
@@ -71,11 +71,15 @@ def test_other_decimal_units_change_the_units_alone():
     assert other.state == pytest.approx(STATE * own.state, rel=1e-14)
     assert other.action == pytest.approx(ACTION * own.action, rel=1e-14)
     assert other.cost == pytest.approx(COST * own.cost, rel=1e-14)
-    assert other.exact() == pytest.approx(COST / STATE * own.exact(), rel=1e-14)
+    assert other.exact_penalty_weights() == pytest.approx(
+        COST / STATE * own.exact_penalty_weights(), rel=1e-14
+    )
 
 
 def test_the_scale_of_theta_is_recounted_with_the_problem():
-    own, other = (ThetaBlocks.of(p, slack_weights=True) for p in problems(Scenario.load("paper")))
+    own, other = (
+        ThetaBlocks.from_problem(p, slack_weights=True) for p in problems(Scenario.load("paper"))
+    )
     assert other.scale == pytest.approx(factors(own) * own.scale, rel=1e-13)
 
 
@@ -91,9 +95,9 @@ def test_a_constant_in_the_cost_changes_nothing(problem):
 def test_without_an_active_bound_the_curvature_of_the_cost_counts():
     units = linear_plant.PLANE.problem.units
     # Bounds ±3 are of the order 10; ∂²ℓ/∂x₀² = 2, so 200 of cost over that.
-    assert units.state.tolist() == [10.0, 10.0] and units.dearest == 0.0
+    assert units.state.tolist() == [10.0, 10.0] and units.largest_multiplier == 0.0
     assert units.cost == 1e3
-    assert (units.exact() > 0).all()
+    assert (units.exact_penalty_weights() > 0).all()
 
 
 def test_without_curvature_the_cost_itself_counts():
@@ -110,7 +114,7 @@ def test_bounds_however_near_or_far_have_units(width):
     extreme = dataclasses.replace(
         problem, state_lower=np.array([0.0]), state_upper=np.array([width])
     )
-    blocks = ThetaBlocks.of(extreme, slack_weights=True)
+    blocks = ThetaBlocks.from_problem(extreme, slack_weights=True)
     assert np.isfinite(blocks.scale).all() and (blocks.scale > 0).all()
 
 

@@ -32,7 +32,7 @@ KINDS = [(blocks, hessian) for blocks in BLOCKS for hessian in HESSIANS]
 @lru_cache
 def controller(blocks, hessian, backend="daqp"):
     problem = evaporator_problem()
-    chosen = ThetaBlocks.of(problem, **BLOCKS[blocks])
+    chosen = ThetaBlocks.from_problem(problem, **BLOCKS[blocks])
     return RtiNmpc(problem, Parameters.naive(problem, chosen), hessian=hessian, backend=backend)
 
 

@@ -15,7 +15,7 @@ MATRIX = ThetaBlock("B", (3, 3), (1.0,) * 6)
 
 
 def test_the_papers_theta_has_its_blocks_in_order(problem):
-    blocks = ThetaBlocks.of(problem)
+    blocks = ThetaBlocks.from_problem(problem)
     assert list(blocks.slices) == [
         "B_lambda", "b_lambda", "c_lambda", "B_Vf", "b_Vf", "B_l", "b_l", "c_f", "x_l", "x_u",
     ]  # fmt: skip
@@ -29,7 +29,7 @@ def test_packing_undoes_unpacking_bit_for_bit(entries):
 
 
 def test_model_parameters_scale_with_their_nominal_value(problem):
-    blocks = ThetaBlocks.of(problem, model_parameters=("UA2", "h"))
+    blocks = ThetaBlocks.from_problem(problem, model_parameters=("UA2", "h"))
     np.testing.assert_allclose(blocks.scale[blocks.slices["p"]], [0.684, 0.016])
 
 
@@ -42,7 +42,9 @@ BLOCKS = {
 
 @pytest.fixture(params=BLOCKS)
 def parameters(request, problem, rng):
-    return random_parameters(problem, ThetaBlocks.of(problem, **BLOCKS[request.param]), rng)
+    return random_parameters(
+        problem, ThetaBlocks.from_problem(problem, **BLOCKS[request.param]), rng
+    )
 
 
 def test_naive_is_the_papers_guess(problem):
@@ -103,7 +105,9 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_file_has_one_clear_error_that_names_it(case, problem, rng, tmp_path):
     pattern, replacement = BAD[case]
-    parameters = random_parameters(problem, ThetaBlocks.of(problem, **BLOCKS["physical"]), rng)
+    parameters = random_parameters(
+        problem, ThetaBlocks.from_problem(problem, **BLOCKS["physical"]), rng
+    )
     path = parameters.save(tmp_path / "theta.toml")
     path.write_text(edited(path.read_text(), pattern, replacement))
     with pytest.raises(ParameterError) as caught:

@@ -234,7 +234,7 @@ def test_a_report_says_what_was_found(made):
     assert report.still == {"u": True}
     assert report.undriven == {"enable": "0"}
     assert report.starts_anywhere
-    assert all(row.subject and row.found for row in report.rows)
+    assert all(row.subject and row.finding for row in report.rows)
 
 
 def test_an_fmu_that_bears_small_changes_only_is_tried_with_those(made):

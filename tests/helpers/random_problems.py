@@ -169,7 +169,9 @@ class InUnits:
             reference_state=np.zeros(case.n), reference_action=np.zeros(case.m),
             reference_cost=cost, substeps=SUBSTEPS,
         )  # fmt: skip
-        self.blocks = ThetaBlocks.of(self.problem, slack_weights=True, model_parameters=("k",))
+        self.blocks = ThetaBlocks.from_problem(
+            self.problem, slack_weights=True, model_parameters=("k",)
+        )
 
     @cached_property
     def factors(self) -> np.ndarray:

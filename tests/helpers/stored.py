@@ -30,7 +30,7 @@ class StoredQp(NamedTuple):
 @lru_cache(maxsize=1)
 def blocks() -> ThetaBlocks:
     """All θ of the set have slack weights; the paper's own are set to the true penalty."""
-    return ThetaBlocks.of(evaporator_problem(), slack_weights=True)
+    return ThetaBlocks.from_problem(evaporator_problem(), slack_weights=True)
 
 
 def write(runs: list[tuple[str, Parameters]], samples: list[tuple[int, StoredQp]]) -> None:

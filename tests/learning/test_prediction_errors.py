@@ -60,7 +60,7 @@ def test_all_pairs_are_averaged_and_an_infinite_bound_costs_nothing(scenario, rn
 
 
 def test_errors_are_those_of_the_model_with_thetas_parameters_and_offset(scenario, problem, rng):
-    blocks = ThetaBlocks.of(problem, model_parameters=("UA2",))
+    blocks = ThetaBlocks.from_problem(problem, model_parameters=("UA2",))
     theta = Parameters.naive(problem, blocks).replace({"p": [5.2], "c_f": [0.1, -0.2]})
     model = problem.model
     f = discretise(model, problem.sampling_time, problem.substeps)

@@ -60,7 +60,7 @@ SMALLEST = 1e-2
 
 @pytest.fixture(scope="module")
 def blocks(problem):
-    return ThetaBlocks.of(problem)
+    return ThetaBlocks.from_problem(problem)
 
 
 def fit_towards(target, metric):
@@ -130,7 +130,7 @@ def test_lmi_step_equals_a_generic_conic_solution(blocks, parameters, rng):
 
 @pytest.fixture
 def controller(problem):
-    return Carrier(Parameters.naive(problem, ThetaBlocks.of(problem, slack_weights=True)))
+    return Carrier(Parameters.naive(problem, ThetaBlocks.from_problem(problem, slack_weights=True)))
 
 
 def towards(blocks, **values):

@@ -63,7 +63,7 @@ def test_a_file_keeps_its_blocks_and_gets_those_it_lacks(problem, tmp_path):
 
 
 def test_a_file_keeps_its_own_slack_weights_and_model_parameters(problem, tmp_path):
-    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2",))
+    blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=("UA2",))
     mine = Parameters.naive(problem, blocks).replace({"w_sigma": [200.0, 300.0], "p": [5.2]})
     path = str(mine.save(tmp_path / "mine.toml"))
     start = starting_parameters(problem, Configuration(model_parameters=("M", "UA2")), path)

@@ -26,7 +26,7 @@ SAMPLES = int(os.environ.get("COSIM_EXPORT_SAMPLES", "100000"))
 def _learnt(scenario: Scenario) -> Parameters:
     """θ about as far from naive as learning goes, with slack weights and bounds of its own."""
     problem = Problem.from_scenario(scenario)
-    blocks = ThetaBlocks.of(problem, slack_weights=True)
+    blocks = ThetaBlocks.from_problem(problem, slack_weights=True)
     return random_parameters(problem, blocks, np.random.default_rng(7))
 
 

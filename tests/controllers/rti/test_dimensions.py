@@ -61,7 +61,7 @@ def compare_all(n, m, horizon, n_d, n_p):
     """Shapes of all read-outs of each Hessian and backend, and the same value by each backend."""
     problem = random_problem(n, m, horizon, n_d, n_p)
     names = ("p0",) if n_p else ()
-    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=names)
+    blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=names)
     parameters = Parameters.naive(problem, blocks)
     s, a = np.full(n, 0.45), np.full(m, 0.2)
     values = {}

@@ -58,7 +58,7 @@ def compiled(request, monkeypatch):
 @pytest.fixture(scope="module")
 def learnt(request):
     problem = evaporator_problem(horizon=getattr(request, "param", 10))
-    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2",))
+    blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=("UA2",))
     return problem, random_parameters(problem, blocks, np.random.default_rng(7))
 
 

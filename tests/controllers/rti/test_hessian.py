@@ -13,7 +13,7 @@ DISCOUNTS = 0.99 ** np.arange(N)
 
 @pytest.fixture(scope="module")
 def blocks():
-    return ThetaBlocks.of(evaporator_problem())
+    return ThetaBlocks.from_problem(evaporator_problem())
 
 
 @pytest.fixture(scope="module")

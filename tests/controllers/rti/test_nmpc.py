@@ -20,7 +20,7 @@ EXTENDED = {"slack_weights": True}
 @pytest.fixture(scope="module")
 def shared():
     problem = evaporator_problem()
-    theta = Parameters.naive(problem, ThetaBlocks.of(problem, **EXTENDED))
+    theta = Parameters.naive(problem, ThetaBlocks.from_problem(problem, **EXTENDED))
     return {hessian: RtiNmpc(problem, theta, hessian=hessian) for hessian in HESSIANS}
 
 
@@ -198,7 +198,7 @@ def test_short_horizons_are_problems_too(horizon, backend):
 
 
 PROBLEM = evaporator_problem()
-BLOCKS = ThetaBlocks.of(PROBLEM, slack_weights=True)
+BLOCKS = ThetaBlocks.from_problem(PROBLEM, slack_weights=True)
 NAIVE = Parameters.naive(PROBLEM, BLOCKS)
 
 

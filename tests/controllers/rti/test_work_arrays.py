@@ -26,7 +26,7 @@ SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover
 
 def theta(problem):
     return Parameters.naive(
-        problem, ThetaBlocks.of(problem, slack_weights=True, model_parameters=("p0",))
+        problem, ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=("p0",))
     )
 
 

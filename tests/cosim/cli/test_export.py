@@ -156,7 +156,7 @@ def test_theta_may_change_between_samples(tmp_path, version):
     """All of it, a bound alone, a parameter of the model: as the Python controller's θ."""
     scenario = Scenario.load("paper").replace({"controller": {"horizon": 3}})
     problem = Problem.from_scenario(scenario)
-    blocks = ThetaBlocks.of(problem, model_parameters=("UA2",))
+    blocks = ThetaBlocks.from_problem(problem, model_parameters=("UA2",))
     naive_theta = Parameters.naive(problem, blocks)
     controller = nmpc(scenario, naive_theta.replace({"b_l": [0.1, 0.0, 0.2, 0.1]}))
     system = sampled_controller(controller, scenario)

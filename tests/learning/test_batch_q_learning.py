@@ -154,3 +154,43 @@ def test_a_restored_buffer_remembers_what_was_solved(collected):
     other.load_state_dict(buffer.state_dict())
     assert_same(other.replay(), first)
     assert counting.feedbacks == 0
+
+
+def theta_after(collected, scenario, problem, change, settings):
+    """θ that batches of 20 of the collected samples lead to, changed by number."""
+    samples = collected[1]
+    configuration = BatchQLearning.Configuration.from_dict({"batch_size": 20} | settings)
+    controller = RtiNmpc(problem, starting_parameters(problem, configuration))
+    with FmuPlant(scenario) as plant:
+        algorithm = looped(BatchQLearning, plant, controller, configuration, 60, seed=5).algorithm
+    for number, sample in enumerate(samples):
+        algorithm.observe(change(number, sample))
+    return controller.theta
+
+
+def test_no_single_sample_decides(collected, scenario, problem):
+    """A cost that is out of all bounds moves θ as far as any other such cost."""
+
+    def theta_with(cost):
+        def broken_once(number, sample):
+            return sample._replace(cost=cost) if number == 30 else sample
+
+        settings = {"intercept": False}
+        return theta_after(collected, scenario, problem, broken_once, settings)
+
+    assert np.array_equal(theta_with(1e9), theta_with(1e12))
+
+
+def test_only_the_expected_penalty_of_the_next_state_counts(collected, scenario, problem):
+    """What a sample's next penalty was by chance takes no part: its expectation stands for it."""
+
+    def as_it_was(number, sample):
+        return sample
+
+    def moved_into_the_next_penalty(number, sample):
+        part = 7.0 * (number % 3)
+        return sample._replace(cost=sample.cost + part, next_penalty=sample.next_penalty + part)
+
+    before = theta_after(collected, scenario, problem, as_it_was, {})
+    after = theta_after(collected, scenario, problem, moved_into_the_next_penalty, {})
+    assert after == pytest.approx(before, rel=1e-9, abs=1e-9)

@@ -55,6 +55,7 @@ class ConvergedNmpc(RtiNmpc):
         try:
             self._linearise_as(lifts=False)
         except QpError as error:
+            # Far from the solution the programme's own Hessian may be indefinite.
             if error.status != NOT_CONVEX:
                 raise
             self._linearise_as(lifts=True)
@@ -76,6 +77,7 @@ class ConvergedNmpc(RtiNmpc):
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         solution = self._solve_qp(s, a)
         for _ in range(self._max_iterations):
+            # Full steps: the last QP's solution is the next point of linearisation.
             last = solution
             last_costates = self._costates.copy()
             self._linearise_at(solution.unshifted)
@@ -96,6 +98,7 @@ class ConvergedNmpc(RtiNmpc):
         states = (solution.predicted_states - last.predicted_states) / scale.state
         actions = (solution.predicted_actions - last.predicted_actions) / scale.action
         costates = (solution.costates[1:] - self._costates) / scale.state_price
+        # Costates may be large where the cost is: their change counts beside their size.
         size = 1 + float(np.abs(last_costates / scale.state_price).max())
         return max(
             float(np.abs(states).max()),

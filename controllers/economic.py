@@ -67,6 +67,7 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     x_next = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
     cost = model.economic_cost(x, u, ca.SX(d), ca.SX(p))
     w = ca.vertcat(x, u)
+    # Bounds are not relaxed: the active ones are read off the solution.
     options: dict[str, Any] = {
         "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-11, "bound_relax_factor": 0.0},
         "print_time": False,
@@ -90,6 +91,7 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     hessian, gradient, jacobian = (value.full() for value in derivatives(point))
     multipliers = gradient.reshape(-1)
     least = _STRICT * max(1.0, np.abs(multipliers).max())
+    # A bound that does not push takes no freedom from the feedback.
     strict = np.flatnonzero(np.abs(multipliers) > least)
     return SteadyState(
         x=point[:n],
@@ -168,6 +170,7 @@ def _unconstrained_feedback(A: Array, B: Array, H: Array, gain: Array, free: Arr
     """Gain of v = Kx, where u = `gain` x + `free` v, by the Riccati equation of v."""
     n = len(A)
     count = free.shape[1]
+    # In the free variables: (x, u) = change (x, v).
     change = np.block([[np.eye(n), np.zeros((n, count))], [gain, free]])
     reduced = change.T @ H @ change
     a = A + B @ gain
@@ -241,6 +244,7 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     rotations = [rotation(A, B, unit) for unit in _symmetric_basis(n)]
     forces = [C.T @ unit @ C for unit in _symmetric_basis(n_c)]
     # The convexified Hessian is linear in α, δP and F: a column each.
+    # In `svec` the cone of positive semidefinite matrices is Clarabel's.
     columns = np.stack([svec(matrix) for matrix in (H, *rotations, *forces)], axis=1)
     triangle, count = columns.shape
     identity = svec(np.eye(size))[:, None]
@@ -355,6 +359,7 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     A = steady.A
     B = steady.B
     try:
+        # The economic cost's feedback is what the tuned one must equal: the certificate.
         economic, _ = local_feedback(A, B, steady.hessian, steady.C)
         convex = convexify(A, B, steady.hessian, steady.C, 1e-3)
         tuned, P = local_feedback(A, B, convex.hessian, steady.C)
@@ -413,6 +418,7 @@ def linearisation_substeps(problem: Problem) -> int:
     substeps = problem.substeps
     present = linear(substeps)
     while substeps <= 1024:
+        # Doubling shows the error of the coarser one: that of the finer is a sixteenth.
         finer = linear(2 * substeps)
         if (np.abs(finer - present) <= 1e-8 * (1.0 + np.abs(present))).all():
             return substeps
@@ -442,6 +448,7 @@ def linear_model(problem: Problem) -> tuple[Array, Array]:
 
 def _rounded(block: Array) -> Array:
     """Entries to six digits, 0 below 1e-9 of the largest, without a solver's last bits."""
+    # The last bits are the solver's and differ between platforms; θ files must not.
     least = 1e-9 * float(np.abs(block).max(initial=0.0))
     kept = [float(f"{x:.6g}") if abs(x) > least else 0.0 for x in block.flat]
     return np.array(kept).reshape(block.shape)

@@ -67,6 +67,7 @@ class StackedFunction:
         room: Mapping[str, int] | None = None,
         memory: Vector | None = None,
     ) -> None:
+        # Dense, so that every result has a fixed place; common subexpressions are computed once.
         self.function = function = ca.Function(
             name,
             [ca.densify(argument) for argument in arguments.values()],
@@ -256,12 +257,15 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
     system = [sys.platform, platform.machine().lower()]
     stored = build_name(files, system)
     if compiler is not None:
+        # Another compiler, or a new version in its place, makes another library.
         status = Path(compiler).resolve().stat()
         system += [compiler, str(status.st_size), str(status.st_mtime_ns), *FLAGS]
     try:
+        # Any number of processes may ask for the same library at once: `_make` locks.
         path = cache_folder("compiled") / f"{build_name(files, system)}.lib"
         if not path.is_file():
             _make(path, files, compiler, stored)
+        # A cache that is cleaned by age keeps what is in use.
         os.utime(path)
     except OSError:
         return None
@@ -293,6 +297,7 @@ def _make(path: Path, files: Mapping[str, bytes], compiler: str | None, stored: 
                 made.write_bytes(content)
             elif compiler is None or not _compiled(compiler, files, folder):
                 return
+            # The library appears whole, in one step, or not at all.
             made.replace(path)
 
 
@@ -313,6 +318,7 @@ def _compiled(compiler: str, files: Mapping[str, bytes], folder: Path) -> bool:
     units = sorted(name for name in files if name.endswith(".c"))
     command = [compiler, *FLAGS, "-o", "library", *units, "-lm"]
     try:
+        # A compiler that hangs must not hang the run: without a library the interpreter does.
         with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
             return child.wait(PATIENCE) == 0 and (folder / "library").is_file()
     except (OSError, subprocess.SubprocessError):

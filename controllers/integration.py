@@ -96,6 +96,7 @@ class _Predictor:
             u: Actions, (P, m).
         """
         _, slopes = self.slopes(x, u)
+        # An eigenvalue solver raises its own error on what is not finite.
         by_state = slopes[:, :, : x.shape[1]]
         finite: Mask = np.array(np.isfinite(by_state).all(axis=(1, 2)))
         return np.linalg.eigvals(np.where(finite[:, None, None], by_state, 0.0)).astype(complex)
@@ -149,6 +150,7 @@ def measure_integration(problem: Problem) -> Integration:
         while substeps <= MAX_SUBSTEPS:
             finer = predict(x, u, 2 * substeps)
             grows = _grows(modes, length / substeps)
+            # Half of the tolerance: the finer prediction, which is compared with, is off too.
             if _errors(present, finer, scale, grows).max() <= INTEGRATION_TOLERANCE / 2:
                 suffices = substeps
                 break
@@ -198,6 +200,7 @@ def _points(problem: Problem) -> Matrix:
     lower = problem.lower
     upper = problem.upper
     reference = problem.reference
+    # The number of corners doubles with each state and action.
     if 2 ** len(lower) <= MAX_CORNERS:
         corners = list(product(*zip(lower, upper, strict=True)))
     else:
@@ -227,6 +230,7 @@ def _errors(present: Matrix, finer: Matrix, scale: Matrix, grows: Mask) -> Matri
 
 def _grows(modes: NDArray[np.complex128], h: float) -> Mask:
     """Whether of modes (P, n) one that decays is outside of the stability region of a step h."""
+    # The stability function of RK4: what a step makes of a mode.
     z = modes * h
     growth = np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)
     return np.asarray(((modes.real < 0) & (growth > 1 + GROWTH_MARGIN)).any(axis=1))

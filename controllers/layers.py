@@ -40,6 +40,7 @@ def torch_layer(controller: RtiNmpc) -> Layer:
     class RtiNmpcFunction(torch.autograd.Function):  # type: ignore[misc,name-defined]
         @staticmethod
         def forward(ctx: Any, states: Any, theta: Any, enforced: Any, points: Any) -> Any:
+            # Derivatives take several times the solution: only where somebody asks.
             needed = any(ctx.needs_input_grad)
             solution = controller.feedback_batch(
                 to_numpy(states),

@@ -16,7 +16,7 @@ from controllers.model_function import ModelFunction
 KINDS = ("states", "actions", "disturbances", "parameters")
 """The kinds of a model's quantities, in the order of its functions' arguments."""
 
-Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
+ModelExpression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 
 TEMPERATURES = ("K", "degC", "degF", "°C", "°F")
 """Units whose zero is not that of the quantity's variation."""
@@ -80,8 +80,8 @@ class Model:
     actions: tuple[Quantity, ...]
     disturbances: tuple[Quantity, ...]
     parameters: tuple[Quantity, ...]
-    ode: Expression = field(repr=False)
-    economic_cost: Expression = field(repr=False)
+    ode: ModelExpression = field(repr=False)
+    economic_cost: ModelExpression = field(repr=False)
     time_unit: float = 1.0
     uncertain: tuple[str, ...] = ()
 
@@ -207,7 +207,7 @@ class Model:
         order = [[*rest, *moved].index(quantity) for quantity in self.disturbances]
         count = len(self.parameters)
 
-        def rearranged(expression: Expression) -> Expression:
+        def rearranged(expression: ModelExpression) -> ModelExpression:
             def call(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
                 return expression(x, u, ca.vertcat(d, p[count:])[order], p[:count])
 

@@ -78,6 +78,7 @@ def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
     """An expression's elementary operations, one a line."""
     function = ca.Function("e", list(symbols), [expression])
     lines = []
+    # Instructions and not the text of the expression: its names and its layout decide nothing.
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         constant = float(function.instruction_constant(k)).hex() if code == ca.OP_CONST else ""
@@ -130,6 +131,7 @@ def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
     arrays["distribution"] = optimum.distribution
     arrays["document"] = np.array(json.dumps(document, sort_keys=True))
     buffer = io.BytesIO()
+    # Through memory, so that the file appears whole or not at all.
     np.savez_compressed(buffer, **arrays)
     return write_atomically(path, buffer.getvalue())
 
@@ -254,6 +256,7 @@ class OptimalPolicy:
             raise QpError(
                 f"state {state} is not {len(self._axes)} finite numbers", status="bad state"
             )
+        # The grid ends where no sample of the closed loop was: say so, and go on.
         row, clamped = self._lookup(state)
         status = "clamped" if clamped else "solved"
         if a is None:
@@ -280,6 +283,7 @@ class OptimalPolicy:
                 status="bad action",
             )
         optimum = self.optimum
+        # An action that is not the policy's has no stored value: compute its expectation.
         smooth = self._operator.values(state, action, optimum.grid, optimum.W)[0]
         return float(smooth) - optimum.gain + self.problem.penalty(state[0].tolist())
 
@@ -293,6 +297,7 @@ class OptimalPolicy:
         clamped = False
         fractions = []
         for x, axis in zip(state, self._axes, strict=True):
+            # The last cell includes its upper end.
             cell = min(max(bisect_right(axis, x) - 1, 0), len(axis) - 2)
             fraction = (x - axis[cell]) / (axis[cell + 1] - axis[cell])
             if not 0.0 <= fraction <= 1.0:
@@ -304,6 +309,7 @@ class OptimalPolicy:
         for corner, offset in self._corners:
             weight = 1.0
             for fraction, high in zip(fractions, corner, strict=True):
+                # Multilinear: the weight of a corner is the product over the axes.
                 weight *= fraction if high else 1.0 - fraction
             if weight:
                 for i, entry in enumerate(self._table[base + offset]):
@@ -427,6 +433,7 @@ def frozen(scenario: Scenario, name: str, value: float) -> Scenario:
         name: The parameter that fouls.
         value: Its value, in the model's unit.
     """
+    # Through the document, so that the changed scenario is validated anew.
     document = scenario.to_dict()
     parameters = document["plant"]["parameters"]
     for fouling_parameter in FOULING_PARAMETERS:
@@ -510,6 +517,7 @@ class QuasiStaticPolicy:
             s: State in the model's units, (n,).
             a: Action to enforce, (m,).
         """
+        # The position is between two plants; its fraction is the share of the second.
         share, lower = modf(self.law.position(max(self._sample, 0) * self._h))
         first = self.policies[int(lower)].feedback(s, a)
         if share == 0.0:
@@ -530,6 +538,7 @@ def stored_optimum(scenario: Scenario) -> str | None:
     A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
     scenario names the plant's own model.
     """
+    # Nobody knows which plant a foreign FMU is.
     if is_file(scenario.plant.fmu) and scenario.plant.model is None:
         return None
     change = change_of(scenario)

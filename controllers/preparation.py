@@ -135,6 +135,7 @@ def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bo
         guess = ca.SX.sym("guess", n)
         lagrangian += ca.dot(M, _curvature(problem, symbols, x, u, guess))
         arguments |= {"M": M, "guess": guess}
+    # By θ and not by p alone: p's symbols are entries of θ's.
     gradient = ca.gradient(lagrangian, symbols["theta"])[blocks.slices["p"]]
     return stage_function("parameter_gradient", arguments, {"gradient": gradient})
 
@@ -579,6 +580,7 @@ def _residual(
         cost = L[k][n:, :] @ ca.vertcat(xi[k], v) + given["q"][n:, k]
         pull = B[k] @ chi[k + 1]
         next_curvature = ca.fabs(ca.diag(next_weight))
+        # The curvature in v_k: of its own stage, and of the next one through the state.
         curvature = ca.fabs(ca.diag(L[k][n:, n:])) + B[k] ** 2 @ next_curvature
         size = ca.fabs(cost)
         for other in (ca.fabs(pull), ca.fabs(nu), curvature):
@@ -621,6 +623,7 @@ class Spectrum:
 
     def undecided(self, tolerance: float = 1e-6) -> bool:
         """Whether an eigenvalue is so close to the floor that the lift has a kink there."""
+        # At the floor itself the lift has a kink, and its derivative is one-sided.
         distance = np.abs(self.values - self.floor)
         return bool((distance < tolerance * np.maximum(1.0, np.abs(self.values))).any())
 

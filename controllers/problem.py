@@ -47,6 +47,7 @@ class Units:
         n = problem.n_states
         powers = np.rint(_power(problem.upper - problem.lower))
         both = np.array([10.0**power for power in powers])
+        # The units of states and actions are the powers of ten nearest to their bounds' widths.
         sizes = _cost_sizes(problem, both)
         cost = 1.0
         if sizes:  # the first one is what the cost is counted in
@@ -91,6 +92,7 @@ class Scale:
         """
         n = problem.n_states
         ranges = problem.upper - problem.lower
+        # A bound that is only there to be far away says nothing of the range of a state.
         steep = 100.0 * problem.penalty_linear / problem.penalty_quadratic
         ranges[:n] = np.minimum(ranges[:n], steep)
         try:
@@ -98,6 +100,7 @@ class Scale:
         except ModelError:  # a size of the cost is wanted here, not its multipliers
             sizes = {}
         level = next(iter(sizes.values()), 1.0)
+        # Powers of two, so that scaling rounds nothing; limits keep products of scales finite.
         both = 2.0 ** np.rint(np.log2(np.clip(ranges, 1e-50, 1e50)))
         cost = 4.0 ** np.rint(np.log2(np.clip(level, 1e-100, 1e100)) / 2)
         return cls(both[:n], both[n:], float(cost), ranges, level)
@@ -180,6 +183,8 @@ def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Ve
     size = np.abs(gradient).max()
     if not size or not (np.isfinite(gradient).all() and np.isfinite(rates).all()):
         return np.zeros(gradient.size)
+    # An equation may be multiplied by any number: in rows of size 1 DAQP's tolerances mean what
+    # they say.
     row_sizes = np.abs(rates).max(axis=1, keepdims=True)
     rows = rates / np.maximum(row_sizes, np.finfo(np.float64).tiny)
     bounds = gradient.size
@@ -208,6 +213,7 @@ def _power(size: ArrayLike) -> Vector:
 
 def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
     try:
+        # A copy that cannot be written to: a frozen problem stays as it was checked.
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ModelError(f"problem: {name} holds no numbers: {values!r}") from error
@@ -298,6 +304,8 @@ class Problem:
         for function in (model.ode, model.economic_cost):
             value = ca.SX(function(x, u, d, p))
             results += [value, ca.jacobian(value, point)]
+        # Evaluated once: a value that is not finite would else appear in the first QP, far from its
+        # cause.
         evaluate = ca.Function("at_reference", [x, u, d, p], results)
         values = evaluate(
             self.reference_state,
@@ -366,6 +374,7 @@ class Problem:
 
     def symbolic_penalty(self, s: ca.SX) -> ca.SX:
         """The penalty of the true bounds as a CasADi expression of a state (n,)."""
+        # At most one of the two bounds is violated, so the larger excess is the violation.
         violation = ca.fmax(ca.fmax(self.state_lower - s, s - self.state_upper), 0)
         return ca.dot(self.penalty_linear, violation) + ca.dot(self.penalty_quadratic, violation**2)
 
@@ -393,6 +402,7 @@ class Problem:
 
         `discount` γ is the problem's own where None.
         """
+        # At γ = 1 the level of the value has no meaning; any finite one serves.
         gamma = self.discount if discount is None else discount
         return self.reference_cost / (1 - gamma) if gamma < 1 else self.reference_cost
 
@@ -425,6 +435,7 @@ def load_model(name: str | None) -> Model:
             'the scenario names no model for this controller; add model = "module:factory" to its '
             'table [controller], for the evaporator "controllers.evaporator:model"'
         )
+    # The module may be a user's: what it raises becomes one line.
     factory = load_plugin(name, f"model '{name}'", ModelError)
     try:
         model = factory()
@@ -503,6 +514,7 @@ class PlantProblem:
         # What the scenario does not say is the model's: its nominal disturbances, without noise.
         nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
         ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
+        # The plant's parameters are the model's nominal ones, where the scenario does not set them.
         parameters = {quantity.name: quantity.nominal for quantity in model.parameters}
         for name, value in plant.parameters.items():
             if name not in parameters:

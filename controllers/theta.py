@@ -78,6 +78,7 @@ class ThetaBlock:
     def pack(self, value: ArrayLike) -> Vector:
         """Flatten an unpacked value; raises ParameterError on a wrong shape or asymmetry."""
         try:
+            # NumPy makes objects of ragged lists, or raises, by its version; both are refused.
             array = np.asarray(value)
         except ValueError:  # ragged nesting
             array = np.array(None)
@@ -90,6 +91,7 @@ class ThetaBlock:
             )
         if not self.symmetric:
             return array.reshape(-1)
+        # A NaN is reported by its label, when the whole of θ is known.
         if not np.array_equal(array, array.T, equal_nan=True):
             raise ParameterError(f"θ block {self.name} must be symmetric: {array.tolist()}")
         return array[upper_triangle(len(array))]
@@ -248,8 +250,10 @@ class Parameters(Shown):
         if theta.shape != (self.blocks.size,):
             raise ParameterError(f"θ has shape {theta.shape}; it must have ({self.blocks.size},)")
         if not np.isfinite(theta).all():
+            # The first entry is named: a message with all of θ helps nobody.
             bad = self.blocks.labels[int(np.flatnonzero(~np.isfinite(theta))[0])]
             raise ParameterError(f"θ is not finite at {bad}")
+        # θ is shared by controllers and logs: who changes it makes a new one.
         theta.flags.writeable = False
         object.__setattr__(self, "theta", theta)
 
@@ -282,6 +286,7 @@ class Parameters(Shown):
         """`other`, which has this θ's blocks, with this θ's values; a longer p keeps its end."""
         values = {block.name: self[block.name] for block in self.blocks}
         if "p" in values:
+            # Estimated disturbances are the last entries of p.
             values["p"] = np.concatenate([values["p"], other["p"][values["p"].size :]])
         return other.replace(values)
 
@@ -300,6 +305,8 @@ class Parameters(Shown):
     @property
     def hash(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of names and exact values."""
+        # Hexadecimal, so that the hash is of the exact values and not of their rounding to
+        # decimals.
         values = [float(value).hex() for value in self.theta]
         content = json.dumps([list(self.blocks.labels), values])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
@@ -370,6 +377,7 @@ class Parameters(Shown):
         document = parse_toml(text, origin, ParameterError)
         file = validated(_File, document, origin, ParameterError)
         values = file.theta
+        # The file's keys say which optional blocks it has, so that it can be read without flags.
         slack_weights = "w_sigma" in values or "W_sigma" in values
         try:
             blocks = ThetaBlocks.from_problem(
@@ -387,6 +395,7 @@ class Parameters(Shown):
             parameters = cls(blocks, np.zeros(blocks.size)).replace(values)
         except (ModelError, ParameterError) as error:
             raise ParameterError(f"{path}: {error}") from error
+        # An edit by hand is caught, unless it is said to be meant.
         if file.hash not in (None, parameters.hash):
             raise ParameterError(
                 f"{path}: the values have hash {parameters.hash}, the file says "
@@ -416,11 +425,13 @@ def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
             place = block.unpack(np.arange(float(block.size))).astype(int)
             part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
         symbols[block.name] = part
+    # So that what reads the weights need not ask whether they are learned.
     symbols.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
     symbols.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
     parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
     if "p" in blocks:
         indices = problem.model.parameter_indices(blocks.block("p").labels)
         for i, index in enumerate(indices):
+            # Those that θ does not hold stay at their nominal values.
             parameters[index] = symbols["p"][i]
     return symbols | {"model_parameters": parameters}

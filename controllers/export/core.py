@@ -146,6 +146,7 @@ def stack_needed(functions: SampleFunctions) -> int:
 
 def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
     """CasADi's C with every function static and without the compiler's remarks on it."""
+    # All is included in one file, next to others' code: no name may leave it.
     helper = re.compile(r"^(?:const )?(?:casadi_real|casadi_int|void|int)\*? casadi_", re.MULTILINE)
     code = c_source(functions, name)
     code = helper.sub(lambda match: f"static {match.group()}", code)
@@ -263,6 +264,7 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
     Raises:
         ControllerError: `name` is no C name.
     """
+    # The name goes into macros and functions: refuse it here, not in the compiler.
     if not _C_NAME.fullmatch(name):
         raise ControllerError(f"'{name}' is no name for C: letters, digits and _ only")
     problem = core.problem
@@ -312,6 +314,7 @@ def _joined(core: Core) -> str:
     for macro, chosen_name in chosen:
         for name, text in files.items():
             files[name] = text.replace(f"#include {macro}", f'#include "{chosen_name}"')
+    # Files guard themselves by their macros; joined into one text each comes once.
     seen: set[str] = set()
 
     def replace(match: re.Match[str]) -> str:

@@ -80,6 +80,7 @@ class NmpcFunctions(SampleFunctions):
         """
         prepared = self.preparation.memory
         read = self.readout.memory
+        # The functions have one memory, which holds the present sample: lend it and put it back.
         saved = prepared.copy(), read.copy()
         prepared[:] = before
         read[:] = after
@@ -258,6 +259,7 @@ class RtiSolution:
         m = self.action.size
         prepared = self.prepared
         if prepared.engine is not None:
+            # Compiled code factorises the KKT matrix, which is singular where LICQ fails.
             jacobians = prepared.engine.policy(prepared.memory, self.memory)
             if jacobians is not None:
                 return jacobians
@@ -290,10 +292,12 @@ class RtiSolution:
         prepared = self.prepared
         for name in SOLUTION_PARTS:
             inputs[name][:] = self._part(name)
+        # The value's gradient needs the first three alone, the policy's derivatives all.
         for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
         if "M" in inputs:
             step = self._step_from_point()
+            # The second-order term is ½ΔwᵀLΔw: its derivative by L, pulled back through the lift.
             seed = step[:, :, None] * step[:, None, :] / 2
             inputs["M"][:] = prepared.contract(seed).reshape(-1)
             inputs["guess"][:] = prepared.part("costates")
@@ -368,6 +372,7 @@ class _Batch:
         parts = [solution.costates[0], solution.value_gradient, solution.action_gradient]
         if not solution.enforced:
             parts += [solution.policy_jacobian.ravel(), solution.policy_state_jacobian.ravel()]
+        # An enforced action has no policy: the end of its row stays zero.
         row = np.concatenate(parts)
         self.slopes[k, : row.size] = row
 
@@ -378,6 +383,7 @@ class _Batch:
         n = self.states.shape[1]
         m = self.actions.shape[1]
         size = self.theta.shape[1]
+        # As `engine_batch` lays a row's derivatives out.
         ends = np.cumsum([n, size, m, m * size])
         by_state, by_theta, by_action, policy_theta, policy_state = np.split(
             self.slopes, ends, axis=1
@@ -419,6 +425,8 @@ class Engine:
         self._after = functions.readout.memory
         self.action: Vector = np.zeros(functions.problem.n_actions)
         before_size, after_size, work_size = map(self._library.engine_sizes, range(3))
+        # CasADi's functions and the C structs share this memory: a size that differs would be a
+        # wrong number, not a crash.
         same = (before_size, after_size) == (self._before.nbytes, self._after.nbytes)
         assert same, "Python and C lay memory out unlike"
 
@@ -449,6 +457,7 @@ class Engine:
             long = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
             stagewise = long or stack_needed(functions) > STACK_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
+        # Beside what is exported, the engine has derivatives and closed loops.
         for name in ("sensitivities.h", "loop.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)
@@ -472,6 +481,7 @@ class Engine:
         return same
 
     def _linearisation_agrees(self, functions: NmpcFunctions) -> bool:
+        # A QP that cannot be prepared is not the compiler's fault; the feedback reports it.
         if self.prepare() != 0:
             return True
         prepared = functions.preparation
@@ -696,6 +706,7 @@ class RtiNmpc:
             self._compilable = False
             warn(f"{reason}: the controller is not compiled, which is slower", ModelWarning)
             return
+        # A library that differs from the interpreter is refused: it would give wrong numbers fast.
         engine = Engine.compile(self._functions)
         if engine is not None and not engine.agrees(self._functions):
             warn(
@@ -722,6 +733,7 @@ class RtiNmpc:
 
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
+        # The constructor sets θ through here too, when there is none yet.
         current = getattr(self, "_parameters", parameters)
         if parameters.blocks is not current.blocks and parameters.blocks != current.blocks:
             raise ParameterError(
@@ -730,6 +742,7 @@ class RtiNmpc:
             )
         parameters.require_well_posed()
         self._parameters = parameters
+        # All that depends on θ alone is written here; the rest is the next preparation's.
         self._hessian.set_parameters(parameters)
         self._prepare.inputs["theta"][:] = parameters.theta
         if "w_sigma" in parameters.blocks:
@@ -765,6 +778,7 @@ class RtiNmpc:
         if self._pending is not None:
             memory = self._pending.memory
             self._pending = None
+            # The read-out has computed the shift: what is left is to copy it.
             self._point[:] = memory[self._next_point]
             self._costates.reshape(-1)[:] = memory[self._next_costates]
             self._prepared = None
@@ -780,6 +794,7 @@ class RtiNmpc:
         targets = (self._x, self._u, self._costates)
         arrays = [np.asarray(values, dtype=np.float64) for values in point]
         for name, target, array in zip(point._fields, targets, arrays, strict=True):
+            # A sum is finite only if all of its terms are, and costs less than NumPy's test.
             if array.shape != target.shape or not isfinite(sum(array.reshape(-1).tolist())):
                 raise ControllerError(
                     f"linearisation point: {name} must be finite with shape {target.shape}, "
@@ -891,6 +906,7 @@ class RtiNmpc:
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         solution = self._solve_qp(s, a)
         if self.iterations > 1:
+            # The sample's other feedbacks begin where `prepare` linearised, so put that back.
             prepared = self.linearisation_point
             try:
                 for _ in range(self.iterations - 1):
@@ -909,6 +925,7 @@ class RtiNmpc:
         prepared = self._prepared
         assert prepared is not None
         self._readout.inputs["s"][:] = state
+        # Check before anything is written: a wrong shape leaves the controller as it was.
         action = None if a is None else _vector("action", a, problem.n_actions)
         try:
             if self._engine is None:
@@ -935,6 +952,7 @@ class RtiNmpc:
     def _solution(self, prepared: Prepared, *, enforced: bool) -> RtiSolution:
         """The solution in the read-out's memory."""
         problem = self.problem
+        # One copy keeps the whole solution; the next feedback writes over the memory.
         memory = self._readout.memory.copy()
         return RtiSolution(
             action=memory[self._first_action] * problem.scale.action + problem.reference_action,
@@ -958,6 +976,7 @@ class RtiNmpc:
 
     def _solve_interpreted(self, a: Vector | None) -> bool:
         """Solve by CasADi's functions and the backend; whether state and action are finite."""
+        # A solver would loop or crash on numbers that are not finite.
         if not self._embed_state(a):
             return False
         self._accept(self._backend.solve(self._qp), enforced=a is not None)
@@ -989,6 +1008,7 @@ class RtiNmpc:
 
     def _read(self, solution: QpSolution, enforced: bool) -> float:
         """Read a solution of the QP out; its residual."""
+        # Which multipliers a backend returns at a kink is an accident: choose them.
         if enforced:
             solution = multipliers_at_kink(self._qp, solution, *self._action_bounds)
         read = self._readout
@@ -1007,6 +1027,7 @@ class RtiNmpc:
         """
         if self._engine is None or self._engine.stagewise or self.iterations > 1:
             return None
+        # A subclass that overrides a phase would be passed over by the loop in C.
         kind = type(self)
         if kind.prepare is not RtiNmpc.prepare or kind.feedback is not RtiNmpc.feedback:
             return None
@@ -1070,6 +1091,7 @@ class RtiNmpc:
             ),
             derivatives=derivatives,
         )
+        # Python solves what compiled code does not, one row after the other.
         rest = np.arange(count)
         if self._engine is not None and self.iterations == 1:
             statuses = self._engine.solve_batch(batch)
@@ -1121,6 +1143,7 @@ def compile_functions(controller: object, samples: int = LONG) -> None:
 
 def _alike(one: Vector, other: Vector) -> bool:
     """Whether two vectors are equal but for rounding, relative to the largest entry."""
+    # Optimised code may round otherwise; a lost result is off by its own size.
     size = float(np.abs(other).max(initial=0.0))
     return bool(np.allclose(one, other, rtol=0.0, atol=1e-9 * size, equal_nan=True))
 

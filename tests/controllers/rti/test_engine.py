@@ -53,6 +53,7 @@ def compiled(request, monkeypatch):
     monkeypatch.delenv("COSIM_COMPILE", raising=False)
     # Without contraction every level gives the same digits, and this one in a tenth of the time.
     monkeypatch.setattr(functions, "FLAGS", ("-O0", *functions.FLAGS[1:]))
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,25 @@ def test_it_gives_what_the_interpreter_gives(learnt, gap):
         reference.feedback(s)
         s = wanted.predicted_states[1] + rng.normal(0, (0.3, 1.0) if k % 5 else (2.0, 3.0))
     assert {name: value for name, value in worst.items() if value > BOUNDS[name]} == {}
+
+
+def test_what_stages_leave_unsolved_is_solved_condensed(compiled, learnt, monkeypatch):
+    ours, reference = both(*learnt)
+    unsolved = nmpc.STATUSES.index("iteration limit")
+    monkeypatch.setattr(nmpc.Engine, "feedback", lambda engine, enforced: unsolved)
+    s = learnt[0].reference_state + 0.3
+    if compiled == "condensed":
+        with pytest.raises(QpError, match="iteration limit"):
+            ours.feedback(s)
+        return
+    solution, expected = ours.feedback(s), reference.feedback(s)
+    for name in list(BOUNDS)[:6]:
+        one, other = getattr(solution, name), np.asarray(getattr(expected, name))
+        np.testing.assert_allclose(one, other, rtol=0, atol=BOUNDS[name] * np.abs(other).max())
+    np.testing.assert_allclose(solution.qp.H, expected.qp.H, rtol=1e-12)
+    monkeypatch.setattr(nmpc.Engine, "solve_batch", lambda engine, batch: np.full(2, unsolved))
+    batch = ours.feedback_batch(np.stack([s, s]))
+    np.testing.assert_allclose(batch.value, expected.value, rtol=1e-9)
 
 
 def test_a_feedback_depends_on_its_point_alone(learnt):

@@ -108,6 +108,7 @@ class MeasureItem(Item[Measured]):
         if isinstance(self.controller, ControllerSource) and self.controller.theta is not None:
             return self._with_theta(self.controller)
         controller = built(self.controller, self.conditions.scenario)
+        # By the length of the whole work, so that its parts have the same digits.
         compile_functions(controller, self.length)
         return controller
 
@@ -116,6 +117,7 @@ class MeasureItem(Item[Measured]):
         # By its content, so that no other θ or code has the same key.
         key = repr((source, sorted(self.conditions.facts.items()), self.length))
         if key not in _kept:
+            # One at a time: a study goes through its θ case by case.
             _kept.clear()
             controller: Any = source.build(self.conditions.scenario)
             compile_functions(controller, self.length)

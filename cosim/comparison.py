@@ -208,6 +208,7 @@ def compare(
             )
         if not value >= 0:
             raise ComparisonError(f"the tolerance of '{name}' must not be negative, not {value}")
+    # In the order of A, so that the report names them as its file does.
     common = [name for name in a.signals if name in b.signals]
     differences = []
     units = {}
@@ -250,6 +251,7 @@ def _difference(
     b: Signal,
     tolerance: float | None,
 ) -> Difference:
+    # As far as both go; the lengths are compared apart.
     count = min(len(a.values), len(b.values))
     x = a.values[:count]
     y = b.values[:count]
@@ -259,6 +261,7 @@ def _difference(
         distance = np.abs(x - y)
     distance[np.isnan(distance)] = inf
     distance[(x == y) | both_missing] = 0.0
+    # The bits, since −0.0 equals 0.0.
     if tolerance is None:
         beyond = (x.view(np.int64) != y.view(np.int64)) & ~both_missing
     else:

@@ -83,6 +83,7 @@ def _modules_of(part: Any) -> list[str]:
     """Modules of users and others that hold a part, and the object that it names."""
     if part is None:
         return []
+    # The code is that of the function, the other arguments are data.
     while isinstance(part, partial):
         part = part.func
     if not isinstance(part, str):

@@ -122,6 +122,7 @@ class MeasureItem(Item[Measured]):
 
     def _new(self) -> Controller:
         controller = built(self.controller, self.conditions.scenario)
+        # By the length of the whole work, so that its parts have the same digits.
         compile_functions(controller, self.length)
         return controller
 

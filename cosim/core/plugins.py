@@ -96,6 +96,7 @@ def _made(
     factory = load_plugin(target, f"controller '{name}'", ControllerLookupError)
     if not callable(factory):
         raise ControllerLookupError(f"controller '{name}' is not a factory of one scenario")
+    # A factory may import modules beside its own only now.
     try:
         with importing():
             controller = factory(scenario)

@@ -74,6 +74,7 @@ def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
     return total
 
 
+# Loop, CSV, recording and comparison follow this table: a derived signal is declared here alone.
 SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("time", unit="s"),
     SignalKind("states", group="states", vector=True),
@@ -306,6 +307,7 @@ def _write(
     header: Sequence[str],
     rows: Iterable[Sequence[str]],
 ) -> Path:
+    # Whole or not at all: a reader never sees half of it.
     with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(header)

@@ -154,9 +154,11 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
         if not path.is_file():
             raise PlantError(f"FMU '{path}' does not exist or is not a file")
         status = path.stat()
-    except (OSError, RuntimeError) as error:  # RuntimeError: Python 3.11's of links in a circle
+    # RuntimeError is Python 3.11's of links in a circle.
+    except (OSError, RuntimeError) as error:
         why = getattr(error, "strerror", None) or error
         raise PlantError(f"FMU '{path}' cannot be read: {why}") from None
+    # A file that has been replaced meanwhile is another FMU.
     key = (path, status.st_mtime_ns, status.st_size)
     with _unpack_lock:
         if key not in _unpacked or not _unpacked[key].folder.is_dir():
@@ -170,6 +172,7 @@ def _unpack(path: Path) -> UnpackedFmu:
             _check_entries(path, archive)
             if DESCRIPTION not in archive.namelist():
                 raise PlantError(f"'{path}' is not an FMU: it has no {DESCRIPTION}")
+            # Of the very file that is unpacked, which may be replaced by another one now.
             stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
             folder = place(archive, digest)
@@ -195,6 +198,7 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
     entries = archive.infolist()
     if len(entries) > MAX_ENTRIES:
         raise PlantError(f"FMU '{path}' is refused: more than {MAX_ENTRIES} entries")
+    # A few bytes may be packed that fill a disk.
     if sum(entry.file_size for entry in entries) > MAX_BYTES:
         raise PlantError(f"FMU '{path}' is refused: unpacks to more than {MAX_BYTES >> 20} MiB")
     for entry in entries:
@@ -206,6 +210,7 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
             raise PlantError(
                 f"FMU '{path}' is refused: entry {entry.orig_filename!r} leads outside its folder"
             )
+        # The upper half of the attributes is Unix's mode.
         if stat.S_ISLNK(entry.external_attr >> 16):
             raise PlantError(f"FMU '{path}' is refused: entry '{name}' is a link")
     archive.NameToInfo = {entry.filename: entry for entry in entries}
@@ -516,7 +521,8 @@ def _copy_of(library: Path) -> Iterator[Path]:
     try:
         yield Path(shutil.copyfile(library, name))
     finally:
-        with suppress(OSError):  # Windows keeps a file that is loaded
+        # Windows keeps a file that is loaded.
+        with suppress(OSError):
             Path(name).unlink()
 
 
@@ -587,6 +593,7 @@ class Instance(ABC):
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
             )
         self._slave = self._load()
+        # Counted once it is there: what could not be loaded bars no other.
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._functions: dict[str, Any] = {}

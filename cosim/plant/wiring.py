@@ -50,6 +50,7 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
         except PlantError as error:
             yield str(error)
         internal = number(simulation.fixedInternalStepSize, 0.0)
+        # Within rounding: both are decimal fractions of a second.
         count = step / internal if step and internal > 0 else 1.0
         if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
             yield (
@@ -354,6 +355,7 @@ def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
     Raises:
         PlantError: the seed is no such integer.
     """
+    # NumPy's integers are some too, and a float is none.
     try:
         integer = operator.index(seed)
     except TypeError:

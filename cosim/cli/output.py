@@ -109,8 +109,8 @@ class Output:
         if fmu not in SHIPPED:
             # The child that is watched unpacks it, so that a warning about it comes once.
             watch(f"FMU '{Path(fmu).absolute()}', or other native code,")
-            found = unpack(fmu)
-            self.note(f"native code of {found.path}, sha256 {found.sha256}")
+            unpacked = unpack(fmu)
+            self.note(f"native code of {unpacked.path}, sha256 {unpacked.sha256}")
 
 
 def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:

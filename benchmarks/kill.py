@@ -40,6 +40,7 @@ name = "runs"
 scenarios = ["paper"]
 training_seeds = { first = 0, count = 2 }
 evaluation = { seeds = 4, steps = 500 }
+curves = { points = 2, seeds = 1, steps = 100 }
 [[case]]
 controller = "tuned"
 [[case]]
@@ -84,7 +85,7 @@ class Job:
 JOBS = (
     Job(
         "training",
-        "train -a batch-q-learning -n 6000 --log-every 100 --checkpoint-every 100 --out out",
+        "train -a batch-q-learning -n 3000 --log-every 100 --checkpoint-every 100 --out out",
         ("out/learning.csv", "out/parameters.toml"),
         again=" --resume",
     ),

@@ -31,21 +31,21 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
 
     Raises ControllerLookupError where it is no RTI-NMPC, ModelError on a name that the model lacks.
     """
-    found: Any = build_controller(name, scenario)
-    if type(found) is not RtiNmpc or found.iterations != 1:
+    controller: Any = build_controller(name, scenario)
+    if type(controller) is not RtiNmpc or controller.iterations != 1:
         raise ControllerLookupError(
             f"controller '{name}' is no RTI-NMPC and cannot be exported; give "
             "naive, tuned or a parameters file (.toml) of a training"
         )
     if not measured:
-        return found
-    problem = replace(found.problem, model=found.problem.model.measuring(measured))
-    given = found.parameters.blocks
-    names = (*(given.block("p").labels if "p" in given else ()), *measured)
+        return controller
+    problem = replace(controller.problem, model=controller.problem.model.measuring(measured))
+    before = controller.parameters.blocks
+    in_theta = before.block("p").labels if "p" in before else ()
     blocks = ThetaBlocks.from_problem(
-        problem, slack_weights="w_sigma" in given, model_parameters=names
+        problem, slack_weights="w_sigma" in before, model_parameters=(*in_theta, *measured)
     )
-    return RtiNmpc(problem, found.parameters.placed_in(Parameters.naive(problem, blocks)))
+    return RtiNmpc(problem, controller.parameters.placed_in(Parameters.naive(problem, blocks)))
 
 
 def sampled_controller(

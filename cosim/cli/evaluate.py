@@ -105,23 +105,29 @@ def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
     """Print the table of controllers and the paired comparisons."""
     from cosim.core.statistics import shown
 
-    found, timing = summary["controllers"], summary["timing"]
-    columns = {
-        "controller": list(found),
-        "J": [shown(row["J"], digits=6) for row in found.values()],
-        "regret %": [_interval(row.get("regret"), 100.0) for row in found.values()],
-        "economic cost": [shown(row["economic_cost"], digits=6) for row in found.values()],
-        "violating %": [f"{100 * row['violating_share']:.2f}" for row in found.values()],
-        "failures": [str(row["failures"]) for row in found.values()],
-        "step µs": [
-            f"{timing[name]['prepare_median_us'] + timing[name]['feedback_median_us']:.0f}"
-            for name in found
-        ],
-    }
-    header = [name for name, cells in columns.items() if any(cells)]  # what is known of any
-    rows = list(zip(*(columns[name] for name in header), strict=True))
+    header = (
+        "controller", "J", "regret %", "economic cost", "violating %", "failures", "step µs",
+    )  # fmt: skip
+    rows = []
+    for name, row in summary["controllers"].items():
+        timing = summary["timing"][name]
+        step = timing["prepare_median_us"] + timing["feedback_median_us"]
+        rows.append(
+            (
+                name,
+                shown(row["J"], digits=6),
+                _interval(row.get("regret"), 100.0),
+                shown(row["economic_cost"], digits=6),
+                f"{100 * row['violating_share']:.2f}",
+                str(row["failures"]),
+                f"{step:.0f}",
+            )
+        )
+    # A column that is known of no controller is left out.
+    kept = [k for k in range(len(header)) if any(row[k] for row in rows)]
+    lines = [[row[k] for k in kept] for row in rows]
     title = f"{summary['scenario']}, {summary['steps']} samples"
-    output.table(f"{title} × {len(summary['seeds'])} seeds", header, rows)
+    output.table(f"{title} × {len(summary['seeds'])} seeds", [header[k] for k in kept], lines)
     if "remark" in summary:
         output.note(summary["remark"])
     if summary["optimum"] is not None:
@@ -129,18 +135,16 @@ def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
             "regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "
             f"{shown(summary['optimal_J'], digits=6)}"
         )
-    if summary["comparisons"]:
+    pairs = []
+    for row in summary["comparisons"]:
+        pair = f"{row['controller']} − {row['reference']}"
+        gain = _interval(row["gain_in_J"], 100.0)
+        pairs.append((pair, _interval(row["differences"]["J"]), gain))
+    if pairs:
         output.table(
             "paired comparisons (95 % interval over seeds)",
             ("controller against reference", "ΔJ", "gain in J %"),
-            [
-                (
-                    f"{row['controller']} − {row['reference']}",
-                    _interval(row["differences"]["J"]),
-                    _interval(row["gain_in_J"], 100.0),
-                )
-                for row in summary["comparisons"]
-            ],
+            pairs,
         )
 
 

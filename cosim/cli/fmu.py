@@ -40,26 +40,32 @@ def show_fmu(file: FmuFileArgument = "evaporator", json: JsonOption = False) -> 
             description, refused = unpacked.description, list(refusals(unpacked))
         except PlantError as error:
             description, refused = None, [str(error)]
-        found = information(_path(file), description)
-        binaries = ", ".join(
-            f"{folder} ({', '.join(made_for)})" if made_for else folder
-            for folder, made_for in found["platforms"].items()
-        )
+        about = information(_path(file), description)
+        binaries = []
+        for platform, made_for in about["platforms"].items():
+            binaries.append(f"{platform} ({', '.join(made_for)})" if made_for else platform)
         out_.note(
-            f"{found['path']}\nsha256 {found['sha256']}\n{found['name']}: {found['description']}\n"
-            f"FMI {found['fmi_version']}: {', '.join(found['flags'])}\nbinaries: {binaries}"
+            f"{about['path']}\nsha256 {about['sha256']}\n{about['name']}: {about['description']}\n"
+            f"FMI {about['fmi_version']}: {', '.join(about['flags'])}"
         )
+        out_.note(f"binaries: {', '.join(binaries)}")
         out_.note("\n".join(f"no plant: {reason}" for reason in refused) or "the plant accepts it")
-        faces = found["flags"].values()
-        names = dict.fromkeys(name for face in faces for name in face)
-        flags = [(name, *(face.get(name, "–") for face in faces)) for name in names]
-        out_.table("capability flags", ("flag", *found["flags"]), flags)
+        faces = about["flags"].values()
+        names: dict[str, None] = {}
+        for face in faces:
+            names |= dict.fromkeys(face)
+        flags = []
+        for name in names:
+            flags.append((name, *(face.get(name, "–") for face in faces)))
+        out_.table("capability flags", ("flag", *about["flags"]), flags)
         header = ("name", "causality", "unit", "start", "min", "max")
-        rows = [[str(v[key] or "") for key in header] for v in found["variables"][:MOST_ROWS]]
-        count = len(found["variables"])
+        rows = []
+        for variable in about["variables"][:MOST_ROWS]:
+            rows.append([str(variable[key] or "") for key in header])
+        count = len(about["variables"])
         more = f", the first {MOST_ROWS} here, all with --json" if count > MOST_ROWS else ""
         out_.table(f"{count} variables{more}", header, rows)
-        out_.json(found | {"refusals": refused})
+        out_.json(about | {"refusals": refused})
 
 
 @fmu_app.command("check")
@@ -91,7 +97,7 @@ def check_fmu(
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", FmuWarning)  # the table says the same
-                found = check_plant(
+                outcome = check_plant(
                     file,
                     states=split_names(states),
                     actions=split_names(actions),
@@ -101,18 +107,18 @@ def check_fmu(
         except PlantError as error:
             if not path.is_file():
                 raise
-            found = PlantCheck(path, False, f"it cannot be a plant: {error}", ())
+            outcome = PlantCheck(path, False, f"it cannot be a plant: {error}", ())
         header = ("checked", "found", "what follows")
-        rows = [(row.subject, row.finding, row.consequence) for row in found.rows]
+        rows = [(row.subject, row.finding, row.consequence) for row in outcome.rows]
         if rows:
-            out_.table(str(found.fmu), header, rows)
-        if found.remarks:
-            remarks = [(remark,) for remark in found.remarks[:MOST_ROWS]]
+            out_.table(str(outcome.fmu), header, rows)
+        if outcome.remarks:
+            remarks = [(remark,) for remark in outcome.remarks[:MOST_ROWS]]
             out_.table("remarks on the model description", ("remark",), remarks)
         if not json:
-            print(found.verdict)
-        out_.json(found.to_dict())
-    if not found.usable:
+            print(outcome.verdict)
+        out_.json(outcome.to_dict())
+    if not outcome.usable:
         raise typer.Exit(1)
 
 

@@ -107,8 +107,8 @@ class Output:
         from cosim.plant.fmi import SHIPPED, unpack
 
         if fmu not in SHIPPED:
-            found = unpack(fmu)
-            self.note(f"native code of {found.path}, sha256 {found.sha256}")
+            unpacked = unpack(fmu)
+            self.note(f"native code of {unpacked.path}, sha256 {unpacked.sha256}")
 
 
 def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:

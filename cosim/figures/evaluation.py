@@ -29,7 +29,7 @@ VIOLATION = 1e-3
 """Violation per sample below which its axis is linear."""
 DECADE = 10.0
 """Ratio of the costs from which their axis is logarithmic."""
-FLOOR = 0.1
+SEED_FLOOR = 0.1
 """Regret in % of single seeds below which its axis is linear."""
 
 
@@ -81,7 +81,7 @@ def _draw_costs(
     values = dot_rows(axes, rows, styles)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
-        regret_axis(axes, "x", np.append(values, 0.0), FLOOR)
+        regret_axis(axes, "x", np.append(values, 0.0), SEED_FLOOR)
         axes.set_xlabel("regret %, 95 % interval")
         return
     least, most = float(values.min()), float(values.max())

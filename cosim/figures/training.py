@@ -28,7 +28,7 @@ from cosim.figures.style import (
     symbol,
 )
 
-GREEDY = palette(["learnt"])["learnt"].color
+LEARNED_COLOR = palette(["learnt"])["learnt"].color
 DECADES = 30.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""
 POINTS = 30
@@ -67,7 +67,7 @@ def training_figure(
     }
     if share[0].size:
         panels["greedy: violating samples %"] = lambda axes: _course(
-            axes, share[0], 100 * share[1], GREEDY, least=1.0
+            axes, share[0], 100 * share[1], LEARNED_COLOR, least=1.0
         )
     if error[0].size > 1:  # a single one makes no curve
         panels["TD error (r.m.s.)"] = lambda axes: _course(axes, *error, INK, least=1e-12)
@@ -125,7 +125,9 @@ def _cost(
         lines.append(("training", samples, shown(cost), _LINE | {"marker": "", "color": INK}))
     samples, cost = _known(log, "greedy_J")
     if cost.size:
-        lines.append(("greedy", samples, shown(cost), _LINE | {"marker": "o", "color": GREEDY}))
+        lines.append(
+            ("greedy", samples, shown(cost), _LINE | {"marker": "o", "color": LEARNED_COLOR})
+        )
     levels = {name: float(shown(level)) for name, level in baselines.items()}
     return cost_lines(axes, lines, levels, relative=best is not None)
 

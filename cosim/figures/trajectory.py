@@ -260,8 +260,8 @@ def _line(
     """Draw a state, or an input, which is held, and shade what is beyond its bounds."""
     values = run[name]
     lower, upper = run.scenario.limits[name]
-    held = "steps-post" if name in run.scenario.plant.actions else "default"
-    axes.plot(time, values, drawstyle=held, color=color, linewidth=width)
+    drawstyle = "steps-post" if name in run.scenario.plant.actions else "default"
+    axes.plot(time, values, drawstyle=drawstyle, color=color, linewidth=width)
     for bound, outside in ((lower, values < lower), (upper, values > upper)):
         if not outside.any():
             continue

@@ -24,7 +24,7 @@ TIME, SAMPLE, STATUS = "time", "sample", "/solver/status"
 SIGNAL = "cosim.Signal"
 """Archetype of the static mark (name, unit) on every entity that holds a signal."""
 _SCALARS = rr.Scalars.descriptor_scalars().component
-_STATUS = rr.StateChange.descriptor_state().component
+_STATE_COLUMN = rr.StateChange.descriptor_state().component
 
 
 @dataclass(frozen=True)
@@ -191,6 +191,6 @@ def _time(rows: pa.Table) -> NDArray[np.float64]:
 
 def _status(changes: pa.Table, samples: NDArray[np.int64]) -> list[str]:
     """Every sample's status from the changes that were recorded."""
-    texts = [text[0] for text in changes[_STATUS].to_pylist()]
+    texts = [text[0] for text in changes[_STATE_COLUMN].to_pylist()]
     last = np.searchsorted(np.asarray(changes[SAMPLE]), samples, side="right") - 1
     return [texts[i] for i in last]

@@ -81,8 +81,8 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
             recordings = client.get_state().recordings
             if not recordings:
                 raise RecordingError(f"{path} holds no recording")
-            known = {line.name for recording in recordings for line in recording.timelines}
-            if at is not None and TIME in known:
+            timelines = {line.name for recording in recordings for line in recording.timelines}
+            if at is not None and TIME in timelines:
                 client.set_time(TIME, duration=at, play_state="paused")
             elif at is not None:
                 client.set_time(SAMPLE, sequence=round(at), play_state="paused")
@@ -106,10 +106,10 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
 
 def _viewer() -> list[str]:
     """The viewer's own program: `python -m rerun` would start it as a grandchild."""
-    found = find_spec("rerun_cli")
-    if found is None or found.origin is None:
+    command = find_spec("rerun_cli")
+    if command is None or command.origin is None:
         raise RecordingError("the viewer is not installed; install rerun-sdk")
-    folder = Path(found.origin).parent
+    folder = Path(command.origin).parent
     bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
     program = folder / ("rerun.exe" if os.name == "nt" else "rerun")
     return [str(bundled if bundled.exists() else program), "--bind", LOOPBACK]

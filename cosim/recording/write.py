@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from learning.training import Training
 
 SERIES = ("#3B94DE", "#E8731F", "#22AC7E", "#CC79A7", "#E5A11A", "#6CC3F0")
-BOUND = "#D8392B"
+BOUND_COLOR = "#D8392B"
 _DRAWABLE = ((0x20, 0x24F), (0x370, 0x4FF), (0x2010, 0x2026))
 _FOOTER = b"RRF2FOOT"
 _WRITE_SECONDS = 30.0
@@ -48,7 +48,7 @@ ALONE = ("states", "actions", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
 HELD = ("actions", "disturbances")
 FREE = (-inf, inf)
-_STATUS, _RESIDUAL = "solver/status", "solver/log_residual"
+_STATUS_ENTITY, _RESIDUAL = "solver/status", "solver/log_residual"
 _GOOD = "#3A9A5B"
 
 
@@ -115,7 +115,7 @@ class RerunRecorder:
         about = _about(scenario, properties)
         self._stream = Stream(self.path, title, about, properties, self._layout())
         solved = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
-        self._stream.rerun.log(_STATUS, solved, static=True)
+        self._stream.rerun.log(_STATUS_ENTITY, solved, static=True)
 
     def record(self, first: int, columns: Mapping[str, Array], status: Sequence[str]) -> None:
         """Append K samples: one column of K rows for each signal.
@@ -175,7 +175,7 @@ class RerunRecorder:
             self._status = word
         if changes:
             words = rr.StateChange.columns(state=[drawable(status[row]) for row in changes])
-            stream.rerun.send_columns(_STATUS, times(samples[changes], time[changes]), words)
+            stream.rerun.send_columns(_STATUS_ENTITY, times(samples[changes], time[changes]), words)
 
     def _record_intermediate(self, stream: Stream, samples: NDArray[np.int64], time: Array) -> None:
         """Send what `intermediate` took since the last call."""
@@ -230,7 +230,9 @@ class RerunRecorder:
             view("disturbances", self._group("disturbances"), along),
             view("prepare and feedback time [s]", self._group("step_time"), along),
             view(self._residual.name, [self._residual], along),
-            rrb.StateTimelineView(name="QP status", contents=[f"/{_STATUS}"], time_view=along),
+            rrb.StateTimelineView(
+                name="QP status", contents=[f"/{_STATUS_ENTITY}"], time_view=along
+            ),
         ]
         right: Any = rrb.TextDocumentView(name="about this run", origin="/about")
         predicted = []
@@ -543,7 +545,7 @@ class Stream:
         for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
             if not isfinite(bound):
                 continue
-            line = Channel(f"bounds/{channel.entity}/{side}", f"{side} bound", color=BOUND)
+            line = Channel(f"bounds/{channel.entity}/{side}", f"{side} bound", color=BOUND_COLOR)
             self.rerun.log(line.entity, _style([line]), static=True)
             level = rr.Scalars.columns(scalars=[bound, bound])
             self.rerun.send_columns(line.entity, ends, level)

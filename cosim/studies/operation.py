@@ -370,7 +370,9 @@ def _regret_rows(runs: pd.DataFrame, name: str, marks: Sequence[int]) -> list[li
     )
     rows = []
     for case, row in grid.iterrows():
-        cells = [f"{_percent(row['median'][m])} ({_percent(row['max'][m])})" for m in marks]
+        cells = [
+            f"{_shown_percent(row['median'][m])} ({_shown_percent(row['max'][m])})" for m in marks
+        ]
         rows.append([str(case), *cells])
     return rows
 
@@ -430,7 +432,7 @@ def _difference_rows(
     return rows
 
 
-def _percent(share: float) -> str:
+def _shown_percent(share: float) -> str:
     return shown(float(share), None, 100.0, 3)
 
 

@@ -39,8 +39,10 @@ from learning.training_run import HELD_OUT
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"
 """Folders of what a study keeps of its runs."""
-ROW, CHECKPOINT = 500, 5000
-"""Most samples between two rows of a log, and about those between two checkpoints."""
+MOST_BETWEEN_ROWS = 500
+"""Samples between two rows of a log, at most."""
+BETWEEN_CHECKPOINTS = 5000
+"""Samples between two checkpoints, about."""
 MOST_SAMPLES = 100_000_000
 """Samples of the longest run."""
 TRAINING_OPTIONS = (
@@ -238,21 +240,22 @@ class Study:
     @cached_property
     def optima(self) -> dict[str, str]:
         """Names of the cases whose J is J*, by scenario; scenarios without one are not there."""
-        return {
-            name: self.named(optimum)
-            for name, scenario in self.scenarios.items()
-            if (optimum := stored_optimum(scenario)) is not None
-        }
+        optima = {}
+        for name, scenario in self.scenarios.items():
+            optimum = stored_optimum(scenario)
+            if optimum is not None:
+                optima[name] = self.named(optimum)
+        return optima
 
     @cached_property
     def references(self) -> list[Case]:
         """Controllers for regret and gap that the study lacks: naive, optimal."""
-        given = {case.controller for case in self.cases}
+        there = {case.controller for case in self.cases}
         wanted: dict[str, list[str]] = {}
         for name, scenario in self.scenarios.items():
-            if NAIVE not in given and scenario.controller.model is not None:
+            if NAIVE not in there and scenario.controller.model is not None:
                 wanted.setdefault(NAIVE, []).append(name)
-            if name in self.optima and self.optima[name] not in given:
+            if name in self.optima and self.optima[name] not in there:
                 wanted.setdefault(self.optima[name], []).append(name)
         return [
             Case(name, tuple(scenarios), BASELINES, controller=name)
@@ -351,12 +354,12 @@ class Study:
         """Options of a training that has the study's number of greedy evaluations."""
         curves = self.held_out(scenario)
         between = max(1, samples // self.table.curves.points)
-        rows = -(-between // ROW)
+        rows = -(-between // MOST_BETWEEN_ROWS)
         log_every = max(1, between // rows)
         return {
             "log_every": log_every,
             "evaluate_every": rows * log_every,
-            "checkpoint_every": log_every * max(1, round(CHECKPOINT / log_every)),
+            "checkpoint_every": log_every * max(1, round(BETWEEN_CHECKPOINTS / log_every)),
             "evaluation_seeds": len(curves.seeds),
             "evaluation_steps": curves.steps,
         }
@@ -400,7 +403,7 @@ def plan(study: Study) -> StudyPlan:
         if seed not in (case.training_seeds or (None,)) or name not in case.scenarios:
             continue
         if (case.name, name) not in content:
-            content[case.name, name] = _read(study, case, name)
+            content[case.name, name] = _read_content(study, case, name)
         runs.append(_run(study, case, name, seed, content[case.name, name]))
     _check_names(study)
     provenance = {
@@ -427,7 +430,7 @@ class _Content:
     theta: str | None
 
 
-def _read(study: Study, case: Case, name: str) -> _Content:
+def _read_content(study: Study, case: Case, name: str) -> _Content:
     """Read what a case needs; raises what a wrong case would raise in its run."""
     scenario = study.scenarios[name]
     controller = ControllerSource.read(study.located(case.controller or case.start))
@@ -528,6 +531,7 @@ def _kept(study: Study, case: Case, name: str, seed: int | None) -> dict[str, st
 
 
 def _check_names(study: Study) -> None:
+    """Raise StudyError where a table names a case that is none."""
     names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]
     for table in study.table.trajectory:
@@ -540,12 +544,21 @@ def _check_names(study: Study) -> None:
 
 
 def _check_known(words: Iterable[str], known: Iterable[str], where: str, kind: str) -> None:
+    """Raise StudyError on a word that is not known.
+
+    Args:
+        words: what the study file gives.
+        known: what it may give.
+        where: field of the study file.
+        kind: what a word names.
+    """
     for word in words:
         if word not in known:
             raise StudyError(f"{where}: there is no {kind} '{word}'{instead(word, known)}")
 
 
 def _is_sequence(annotation: Any) -> bool:
+    """Whether a field of this type takes a list, as one of its alternatives too."""
     if get_origin(annotation) in SEQUENCES or annotation in SEQUENCES:
         return True
     return any(_is_sequence(part) for part in get_args(annotation) if part is not Ellipsis)
@@ -557,8 +570,10 @@ def _axis(algorithm: str, setting: str, value: Any) -> list[Any]:
         return [value]
     field = load_algorithm(algorithm).Configuration.model_fields.get(setting)
     nested = bool(value) and all(isinstance(item, list) for item in value)
-    return value if nested or field is None or not _is_sequence(field.annotation) else [value]
+    takes_a_list = field is not None and _is_sequence(field.annotation)
+    return [value] if takes_a_list and not nested else value
 
 
 def _text(value: Any) -> str:
+    """A value of a grid as it stands in the name of its case."""
     return Path(value).stem if isinstance(value, str) else json.dumps(value).replace(" ", "")

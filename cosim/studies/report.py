@@ -19,7 +19,10 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 from cosim.core.result import markdown_table
 from cosim.core.statistics import shown
 
-PAGE, TABLES, FOLDER = "report.html", "report.md", "figures"
+PAGE = "report.html"
+MARKDOWN = "report.md"
+FOLDER = "figures"
+"""Folder of the figures."""
 
 Text = Callable[[Mapping[str, Any]], str]
 """Text of a table's cell, from the row."""
@@ -52,7 +55,7 @@ COLUMNS: dict[str, tuple[str, Text]] = {
 SHORT = ("case", "rank", "regret", "worst", "finished")
 """Columns that fit a terminal of 80 characters."""
 
-AGGREGATE: dict[str, Text] = {
+AGGREGATE_TEXTS: dict[str, Text] = {
     "case": lambda row: row["case"],
     "runs": lambda row: str(row["runs"]),
     "regret %, IQM [95 %]": lambda row: _percent(row, "regret_iqm"),
@@ -99,16 +102,36 @@ def rendered(template: str, **context: Any) -> str:
 def texts(
     rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Text]
 ) -> tuple[Sequence[str], list[list[str]]]:
-    """Header and rows of a table, whose columns are texts of a row by their header."""
-    return list(columns), [[text(row) for text in columns.values()] for row in rows]
+    """A table as texts.
+
+    Args:
+        rows: the table's rows.
+        columns: for each header what makes the text of a cell from its row.
+
+    Returns:
+        Header and rows.
+    """
+    lines = []
+    for row in rows:
+        lines.append([text(row) for text in columns.values()])
+    return list(columns), lines
 
 
 def _percent(row: Mapping[str, Any], name: str, ends: str = "", digits: int = 3) -> str:
-    """A share in per cent with its interval, if any; empty if undefined."""
-    low, high = (float(row.get(f"{ends or name}_{end}", np.nan)) for end in ("low", "high"))
+    """A share in per cent with its interval, if any; empty if undefined.
+
+    Args:
+        row: of a table.
+        name: column of the share.
+        ends: column of the interval, without `_low` and `_high`; default: the share's.
+        digits: significant ones.
+    """
     if np.isnan(row[name]):
         return ""
-    return shown(float(row[name]), None if np.isnan(low) else (low, high), 100.0, digits)
+    low = float(row.get(f"{ends or name}_low", np.nan))
+    high = float(row.get(f"{ends or name}_high", np.nan))
+    interval = None if np.isnan(low) else (low, high)
+    return shown(float(row[name]), interval, 100.0, digits)
 
 
 def _number(value: float) -> str:
@@ -136,10 +159,10 @@ def commit() -> str:
     """Short commit of the checkout that the package is in, `+` if it was edited; else empty."""
     folder = Path(__file__).parent
     try:
-        found = subprocess.run(
+        described = subprocess.run(
             ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--exclude=*"],
             capture_output=True, text=True, timeout=10, check=True,
         )  # fmt: skip
     except (OSError, subprocess.SubprocessError):
         return ""
-    return found.stdout.strip()
+    return described.stdout.strip()

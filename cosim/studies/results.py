@@ -542,18 +542,18 @@ class StudyResults(Shown):
             return None
         controllers = rows[rows.training_seed.isna()].set_index("case").greedy_J
         best = float(controllers.get(self.about["optimum"].get(scenario), np.nan))
-        known = bool(np.isfinite(best))
+        is_known = bool(np.isfinite(best))
         curves = {}
         for case, log in learned:
-            curves[str(case)] = figures.learning_curve(log, best if known else None)
+            curves[str(case)] = figures.learning_curve(log, best if is_known else None)
         levels = self._levels(scenario, controllers, greedy.last().groupby("case").median())
-        if known:
+        if is_known:
             levels[:] = 100 * statistics.regrets(levels.to_numpy(), best)
         return figures.curves_figure(
             curves,
             {str(name): float(cost) for name, cost in levels.items()},
             self._styles,
-            relative=known,
+            relative=is_known,
         )
 
     def _levels(self, scenario: str, controllers: pd.Series, trained: pd.Series) -> pd.Series:
@@ -619,7 +619,7 @@ class StudyResults(Shown):
             # Those of a stored study's single runs are there once `cosim results draw` drew them.
             return report.image(path) if path.is_file() else None
 
-        for name in (report.TABLES, report.PAGE):
+        for name in (report.MARKDOWN, report.PAGE):
             write_atomically(self.folder / name, report.rendered(name, **page, picture=picture))
         return self.folder / report.PAGE
 
@@ -639,7 +639,7 @@ class StudyResults(Shown):
                 }
             )
         if len(self.aggregate):
-            table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE)
+            table = report.texts(self.aggregate.to_dict("records"), report.AGGREGATE_TEXTS)
             sections.append({"title": "All scenarios", "table": table})
         for title, header, rows in self.further_tables():
             sections.append({"title": title, "table": (header, rows)})

@@ -228,13 +228,13 @@ def differences(
         if table not in computed:
             lines.append(f"{name}: {table} is stored but not computed any more")
             continue
-        before = _read(stored / table, wanted[table])
-        after = _read(now / table, wanted[table])
+        before = _read_stored(stored / table, wanted[table])
+        after = _read_stored(now / table, wanted[table])
         lines += _table_differences(f"{name}/{table}", before, after, tolerances)
     return lines
 
 
-def _read(path: Path, keys: list[str]) -> pd.DataFrame:
+def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
     """A stored table by its key columns.
 
     The columns named in `WORDS` hold texts, all others floats. `attrs` has the columns' units.
@@ -295,10 +295,12 @@ def _table_differences(
         (stored, now, "stored but not computed any more", "stored, not computed"),
         (now, stored, "computed but not stored", "not stored"),
     ):
-        for row in table.index.difference(other.index, sort=False)[:1]:
-            lines.append(f"{name}: row {_row(table, row)} is {rows}")
-        if len(lone := table.columns.difference(other.columns, sort=False)):
-            lost.append(f"{name}: signal {', '.join(lone)} is {columns}")
+        lone_rows = table.index.difference(other.index, sort=False)
+        if len(lone_rows):
+            lines.append(f"{name}: row {_row(table, lone_rows[0])} is {rows}")
+        lone_columns = table.columns.difference(other.columns, sort=False)
+        if len(lone_columns):
+            lost.append(f"{name}: signal {', '.join(lone_columns)} is {columns}")
     common = stored.index.intersection(now.index, sort=False)
     units = now.attrs | stored.attrs
     # Taken once: to take them for each signal is most of the time that a check needs.
@@ -326,10 +328,10 @@ def _table_differences(
 def _tolerance_of(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
     """The signal's own tolerance, else the first matching pattern's (`theta *`)."""
     names = [signal, *(name for name in tolerances if fnmatchcase(signal, name))]
-    known = [name for name in names if name in tolerances]
-    if not known:
+    fitting = [name for name in names if name in tolerances]
+    if not fitting:
         raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
-    tolerance = tolerances[known[0]]
+    tolerance = tolerances[fitting[0]]
     if unit and unit != tolerance.unit:
         raise ResultsError(
             f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in '{tolerance.unit}'"

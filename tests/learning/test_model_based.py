@@ -170,7 +170,7 @@ def test_theta_moves_only_where_the_model_predicts_less(
     settings = {"first_update": 30, "exploration_samples": 1, **rollouts}
     run = make_run("model-based", scenario, settings, start=start, **every)
     done = run_training(run)
-    (row,) = done.rows
+    _, row = done.rows
     assert (row["updates"], row["refused"]) == (1, 1 - moves)
     assert np.array_equal(done.parameters.theta, done.start.theta) != moves
     if moves:

@@ -431,10 +431,12 @@ class Engine:
         assert same, "Python and C lay memory out unlike"
 
         # Work of a sample and of other calls: the next feedback needs the preparation's factors.
-        # These pointers keep their arrays.
-        work = _pointer(np.zeros(work_size // 8 + 1))
-        self._other_work = _pointer(np.zeros(work_size // 8 + 1))
-        self._loop = _pointer(np.zeros(self._library.engine_loop_size() // 8 + 1))
+        self._arrays = (
+            np.zeros(work_size // 8 + 1),
+            np.zeros(work_size // 8 + 1),
+            np.zeros(self._library.engine_loop_size() // 8 + 1),
+        )
+        work, self._other_work, self._loop = map(_pointer, self._arrays)
         before = _pointer(self._before)
         after = _pointer(self._after)
         self._value_arguments = (before, work, after, None)
@@ -523,10 +525,12 @@ class Engine:
         """
         count = len(batch.states)
         statuses = np.empty(count, dtype=np.intc)
+        before = self._before.copy()
+        after = self._after.copy()
         x, u, _ = batch.points
         self._library.engine_batch(
-            _pointer(self._before.copy()),
-            _pointer(self._after.copy()),
+            _pointer(before),
+            _pointer(after),
             self._other_work,
             ctypes.c_longlong(count),
             _pointer(batch.states),
@@ -590,8 +594,8 @@ class Engine:
 
 
 def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
-    """Pointer to an array's numbers, which keeps the array; null for None."""
-    return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
+    """Pointer to the numbers of an array, which its caller keeps; null for None."""
+    return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
 class RtiNmpc:
@@ -919,14 +923,14 @@ class RtiNmpc:
     def _solve_qp(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         """Solve the prepared QP for a state; raises QpError where it is not solved."""
         problem = self.problem
-        state = _vector("state", s, problem.n_states)
+        state = _vector("state", s, problem.reference_state.size)
         if self._prepared is None:
             self.prepare()
         prepared = self._prepared
         assert prepared is not None
         self._readout.inputs["s"][:] = state
         # Check before anything is written: a wrong shape leaves the controller as it was.
-        action = None if a is None else _vector("action", a, problem.n_actions)
+        action = None if a is None else _vector("action", a, problem.reference_action.size)
         try:
             if self._engine is None:
                 finite = self._solve_interpreted(action)

@@ -16,7 +16,7 @@ import numpy as np
 
 from controllers import OptimalPolicy
 from controllers import optimum as store
-from controllers.dynamic_programming import SEARCH, Estimate, Settings, objection
+from controllers.dynamic_programming import SEARCH, GainEstimate, Settings, objection
 from controllers.problem import PlantProblem
 from cosim.core.plugins import build_controller
 from cosim.core.scenario import Scenario
@@ -52,7 +52,7 @@ def main() -> None:
     base = next(figure for figure in found.certificate if figure.name == "simulation")
     value, (low, high) = base.value + difference.value, difference.interval
     half_width = 0.5 * float(np.hypot(high - low, base.upper - base.lower))
-    figure = Estimate(SEARCH, value, value - half_width, value + half_width)
+    figure = GainEstimate(SEARCH, value, value - half_width, value + half_width)
     others = [one for one in found.certificate if one.name != SEARCH]
     found = replace(found, certificate=(*others, figure))
     print(store.keep(key, found))

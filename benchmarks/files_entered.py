@@ -53,11 +53,11 @@ def step() -> Entered:
     """2400 samples of Q-learning on a plant in operation, its steps of θ included."""
     from controllers import compile_functions
     from learning.algorithm import load_algorithm
-    from learning.training_run import begin, make_run
+    from learning.training_run import begin_training, make_run
 
     run = make_run("q-learning", cosim.Scenario.load("fouled"), 2400)
     with cosim.FmuPlant(run.scenario) as plant:
-        loop = begin(run, load_algorithm(run.algorithm), plant)
+        loop = begin_training(run, load_algorithm(run.algorithm), plant)
         compile_functions(loop.controller, run.samples)
         with Entered() as found:
             for _ in range(run.samples):

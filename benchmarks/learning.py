@@ -8,7 +8,7 @@ from benchmarks.measuring import clock, figure
 from controllers import compile_functions
 from cosim import FmuPlant
 from learning.algorithm import load_algorithm
-from learning.training_run import begin, make_run
+from learning.training_run import begin_training, make_run
 
 ALGORITHMS = ("q-learning", "actor-critic", "batch-q-learning")
 REPETITIONS = 20
@@ -28,7 +28,7 @@ def measure(scenario, steps):
             for mode in seconds:
                 plant = stack.enter_context(FmuPlant(scenario))
                 with patch.dict(os.environ, COSIM_COMPILE=mode):
-                    loops[mode] = begin(run, load_algorithm(name), plant)
+                    loops[mode] = begin_training(run, load_algorithm(name), plant)
                     compile_functions(loops[mode].controller, run.samples)
                 take(loops[mode], SETTLING)
             for _ in range(REPETITIONS):

@@ -25,7 +25,7 @@ from cosim.core.simulation import simulate
 from cosim.core.statistics import regrets
 from cosim.plant import FmuPlant
 from learning.model_based import ModelBased
-from learning.training_run import TrainingRun, begin, make_run
+from learning.training_run import TrainingRun, begin_training, make_run
 
 PARTS = {
     "parameters": {"parameter_deviation": 1e-6},  # W alone is fitted
@@ -81,7 +81,7 @@ def main() -> None:
     best: dict[str, float] = {}
     costs: list[float] = []
     with FmuPlant(scenario) as plant:
-        loop = begin(run, ModelBased, plant)
+        loop = begin_training(run, ModelBased, plant)
         judged = nmpc(scenario, loop.parameters)
         compile_functions(loop.controller, samples)
         print(f"{scenario.name} from {run.start}, seed {run.seed}, -{without}")

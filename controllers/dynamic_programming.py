@@ -802,7 +802,7 @@ def scan(
 _RESTART = 1e-9
 
 
-class Estimate(NamedTuple):
+class GainEstimate(NamedTuple):
     """An estimate of J*: how it was made, its value and interval [lower, upper]."""
 
     name: str
@@ -829,7 +829,7 @@ class Optimum:
     accuracy: Accuracy
     lower: float = -np.inf
     upper: float = np.inf
-    certificate: tuple[Estimate, ...] = ()
+    certificate: tuple[GainEstimate, ...] = ()
     step: Array = field(default_factory=partial(np.zeros, 0))
 
     @property
@@ -940,7 +940,7 @@ def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int
     )
 
 
-Progress = Callable[[int, int, Optimum], None]
+RoundProgress = Callable[[int, int, Optimum], None]
 """Called with the grid's level, the round on it and its result."""
 
 
@@ -950,7 +950,7 @@ REQUIRED_ESTIMATES = ("solution", "refinement", "simulation")
 SEARCH = "policy search"
 
 
-def objection(certificate: Sequence[Estimate]) -> str | None:
+def objection(certificate: Sequence[GainEstimate]) -> str | None:
     """Why a certified solution may not be called J*, or None.
 
     All estimates but that of a policy search must agree within `CERTIFICATE_TOLERANCE`.
@@ -984,7 +984,7 @@ def solve(
     settings: Settings | None = None,
     *,
     workers: int = 2,
-    progress: Progress | None = None,
+    progress: RoundProgress | None = None,
 ) -> Optimum:
     """Solve for the optimal policy of the stochastic plant by Howard's policy iteration.
 
@@ -1028,7 +1028,7 @@ def _iterate(
     iterate: Optimum,
     level: int,
     settings: Settings,
-    progress: Progress | None,
+    progress: RoundProgress | None,
     *,
     scan_points: int = 3,
     rounds: int | None = None,
@@ -1134,7 +1134,7 @@ def certify(
     *,
     paths: int = 2000,
     steps: int = 5000,
-    progress: Progress | None = None,
+    progress: RoundProgress | None = None,
 ) -> Optimum:
     """The solution on the grid of the next level, started from a solution, with a certificate.
 
@@ -1159,8 +1159,8 @@ def certify(
     refinement = _accepted(_iterate(operator, start, level, settings, progress))
     mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
     certificate = (
-        Estimate("solution", optimum.gain, optimum.lower, optimum.upper),
-        Estimate("refinement", refinement.gain, refinement.lower, refinement.upper),
-        Estimate("simulation", mean, mean - half_width, mean + half_width),
+        GainEstimate("solution", optimum.gain, optimum.lower, optimum.upper),
+        GainEstimate("refinement", refinement.gain, refinement.lower, refinement.upper),
+        GainEstimate("simulation", mean, mean - half_width, mean + half_width),
     )
     return replace(refinement, certificate=certificate)

@@ -14,7 +14,7 @@ DISTURBANCES = (
     Quantity("T1", "degC", 40.0, magnitude=40.0),
     Quantity("T200", "degC", 25.0, magnitude=25.0),
 )
-PARAMETERS = (
+PARAMETER_VALUES = (
     Quantity("a", "degC/kPa", 0.5616),
     Quantity("b", "degC/%", 0.3126),
     Quantity("c", "degC", 48.43),
@@ -79,7 +79,7 @@ def model() -> Model:
         states=STATES,
         actions=ACTIONS,
         disturbances=DISTURBANCES,
-        parameters=PARAMETERS,
+        parameters=PARAMETER_VALUES,
         ode=_ode,
         economic_cost=_economic_cost,
         time_unit=60.0,

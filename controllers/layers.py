@@ -13,7 +13,7 @@ Layer = Callable[..., tuple[Any, Any]]
 
 # The arrays of a `BatchSolution` in its order, as both packages get them: first what the layer
 # returns, then the derivatives that its backward pass contracts.
-OUTPUTS = ("action", "value")
+LAYER_OUTPUTS = ("action", "value")
 DERIVATIVES = (
     "state_gradient",
     "value_gradient",
@@ -94,7 +94,7 @@ def jax_layer(controller: RtiNmpc) -> Layer:
 
     def solve(derivatives: bool, states: Any, *others: Any) -> Any:
         """Arrays of the solution by JAX's callback, which must say their shapes beforehand."""
-        names = OUTPUTS + DERIVATIVES if derivatives else OUTPUTS
+        names = LAYER_OUTPUTS + DERIVATIVES if derivatives else LAYER_OUTPUTS
 
         def call(*arguments: Any) -> Any:
             solution = controller.feedback_batch(*arguments, derivatives=derivatives)

@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike
 from controllers.dynamic_programming import (
     Accuracy,
     BellmanOperator,
-    Estimate,
+    GainEstimate,
     Grid,
     Optimum,
-    Progress,
+    RoundProgress,
     Settings,
     solve,
 )
@@ -37,7 +37,7 @@ from cosim.core.scenario import ChangeTable, Scenario, is_file
 
 SOLVER_VERSION = 2
 """Part of every key; to be raised when the solver's results change."""
-SHIPPED = Path(__file__).parent / "optima"
+SHIPPED_OPTIMA = Path(__file__).parent / "optima"
 SECONDS_A_DAY = 86400.0
 FOULING_NODES = 6
 """Values of the fouled parameter whose optima make the quasi-static reference."""
@@ -90,7 +90,7 @@ def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
 
 def stored_file(key: str) -> Path | None:
     """File of a solved problem by its key: the package's own, else the user's, else None."""
-    paths = (folder / f"{key}.npz" for folder in (SHIPPED, cache_folder("optima")))
+    paths = (folder / f"{key}.npz" for folder in (SHIPPED_OPTIMA, cache_folder("optima")))
     return next((path for path in paths if path.is_file()), None)
 
 
@@ -180,7 +180,7 @@ def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optim
         ),
         lower=float(document["lower"]),
         upper=float(document["upper"]),
-        certificate=tuple(Estimate(**estimate) for estimate in document["certificate"] or ()),
+        certificate=tuple(GainEstimate(**estimate) for estimate in document["certificate"] or ()),
     )
 
 
@@ -213,7 +213,7 @@ class OptimalPolicy:
         cls,
         scenario: Scenario,
         *,
-        progress: Progress | None = None,
+        progress: RoundProgress | None = None,
     ) -> OptimalPolicy:
         """Optimal policy of a scenario: shipped, cached, or solved now and cached.
 
@@ -468,7 +468,7 @@ class QuasiStaticPolicy:
 
     @classmethod
     def from_scenario(
-        cls, scenario: Scenario, *, progress: Progress | None = None
+        cls, scenario: Scenario, *, progress: RoundProgress | None = None
     ) -> QuasiStaticPolicy:
         """Policy of a scenario whose plant changes; optima that are not stored are solved.
 

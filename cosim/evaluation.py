@@ -36,7 +36,14 @@ NAIVE = "naive"
 OPTIMAL = "optimal"
 EVALUATION = "evaluation.csv"
 TIMING = "timing.csv"
-FILES = (EVALUATION, TIMING, "evaluation.png", "scenario.toml", "summary.json", "judged.csv")
+EVALUATION_FILES = (
+    EVALUATION,
+    TIMING,
+    "evaluation.png",
+    "scenario.toml",
+    "summary.json",
+    "judged.csv",
+)
 """Files of an evaluation; all in a folder belong to one."""
 MOST_SEEDS = 1_000_000
 Progress = Callable[[int, str, str], None]
@@ -44,7 +51,7 @@ Progress = Callable[[int, str, str], None]
 
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
 COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
-COLUMNS = [
+EVALUATION_COLUMNS = [
     "controller", "scenario", "seed", "steps", "economic_cost", "mean_violation",
     "violating_share", "J", "regret", "gap_closed", "gain_in_J", "input_effort", "failures",
     "version", "versions", "code_hash", "scenario_hash", "fmu_sha256", "parameters_hash",
@@ -250,7 +257,7 @@ def _check_names(controllers: Mapping[str, Factory | str]) -> None:
         raise EvaluationError(f"'{OPTIMAL}' names the controller that gives J*, not '{optimal}'")
 
 
-NO_NOISE = "no noise: all seeds are the same run, and an interval of width 0 says nothing"
+SAME_RUNS_NOTE = "no noise: all seeds are the same run, and an interval of width 0 says nothing"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -348,7 +355,7 @@ class Evaluation(Result):
         frame["regret"] = statistics.regrets(cost, optimal)
         frame["gap_closed"] = statistics.gaps_closed(cost, naive, optimal)
         frame["gain_in_J"] = statistics.gains(cost, reference)
-        return frame[COLUMNS].astype({"failures": int})
+        return frame[EVALUATION_COLUMNS].astype({"failures": int})
 
     def _rows(self, frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
         rows = pd.concat({name: frames[name] for name in self.controllers})
@@ -378,7 +385,7 @@ class Evaluation(Result):
 
     def write(self, folder: str | Path) -> None:
         """Write evaluation.csv, evaluation.png, timing.csv and scenario.toml, all or none."""
-        with staged(folder, FILES) as stage:
+        with staged(folder, EVALUATION_FILES) as stage:
             self.write_files(stage)
 
     def write_files(self, folder: Path) -> None:
@@ -407,7 +414,7 @@ class Evaluation(Result):
         document: dict[str, Any] = dict(self.facts)
         document["seeds"] = list(self.seeds)
         if self.without_noise:
-            document["remark"] = NO_NOISE
+            document["remark"] = SAME_RUNS_NOTE
         document["reference"] = self.reference
         document["optimum"] = self.optimum
         document["optimal_J"] = None if self.optimum is None else float(np.mean(self.optimal))
@@ -523,7 +530,7 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise EvaluationError(f"'{folder}' holds no .csv file")
-    runs = {path: _read(path, scenario) for path in paths}
+    runs = {path: _read_trajectory(path, scenario) for path in paths}
     _check_seeds_and_lengths(runs)
     optimum_name = stored_optimum(scenario)
     optimum = None if optimum_name is None else build_controller(optimum_name, scenario)
@@ -577,7 +584,7 @@ def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) ->
             )
 
 
-def _read(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
+def _read_trajectory(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
     """Seed, player and number of samples of a file."""
     number = re.search(r"(\d+)$", path.stem)
     if number is None:

@@ -18,7 +18,7 @@ from cosim.core.scenario import Scenario
 from cosim.plant.fmi import unpack
 
 DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
-SUFFIXES = (".py", ".toml", ".fmu", ".npz", ".c", ".h", ".in")
+CODE_SUFFIXES = (".py", ".toml", ".fmu", ".npz", ".c", ".h", ".in")
 ASIDE = {"cli", "figures", "recording", "results", "__pycache__", "report.py", "figures.py"}
 """Files and folders that bear on no number; `results` is in a wheel only."""
 
@@ -126,7 +126,7 @@ def code_hash() -> str:
     for package in OURS:
         for path in sorted((ROOT / package).rglob("*")):
             relative = path.relative_to(ROOT)
-            counts = path.suffix in SUFFIXES and not ASIDE & set(relative.parts)
+            counts = path.suffix in CODE_SUFFIXES and not ASIDE & set(relative.parts)
             if counts and path.is_file():
                 digest.update(f"{relative.as_posix()}\0".encode())
                 digest.update(hashlib.sha256(path.read_bytes()).digest())

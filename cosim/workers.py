@@ -32,7 +32,7 @@ WORKER_SECONDS = 300.0
 ROUNDS = 3
 """Times that workers may die without having finished one item."""
 Key = TypeVar("Key", bound=Hashable)
-Result = TypeVar("Result")
+Outcome = TypeVar("Outcome")
 
 
 @dataclass(frozen=True)
@@ -109,18 +109,18 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class Item(Generic[Result]):
+class Item(Generic[Outcome]):
     """A unit of work of one process, whole by its content; `run` does it."""
 
     conditions: Conditions
 
-    def run(self) -> Result:
+    def run(self) -> Outcome:
         """Do the work."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class Report(Generic[Result]):
+class Report(Generic[Outcome]):
     """What a worker says of an item.
 
     Attributes:
@@ -129,10 +129,10 @@ class Report(Generic[Result]):
     """
 
     facts: Mapping[str, str]
-    result: Result | Failure
+    result: Outcome | Failure
 
 
-def perform(item: Item[Result]) -> Report[Result]:
+def perform(item: Item[Outcome]) -> Report[Outcome]:
     """Do an item in this process; any exception, `sys.exit` too, becomes a Failure."""
     facts: Mapping[str, str] = {}
     try:
@@ -156,10 +156,10 @@ def perform(item: Item[Result]) -> Report[Result]:
 
 
 def done(
-    items: Mapping[Key, Item[Result]],
+    items: Mapping[Key, Item[Outcome]],
     jobs: int,
     scheduler: str | None,
-) -> Iterator[tuple[Key, Result | Failure]]:
+) -> Iterator[tuple[Key, Outcome | Failure]]:
     """Do items; yield the key of each with its result as it ends, in no certain order.
 
     What a worker has found is compared with the item's facts; a result of others is a Failure.
@@ -199,7 +199,7 @@ def done(
                 ) from None
 
 
-def begin(parent: int) -> None:
+def begin_worker(parent: int) -> None:
     """Leave Ctrl-C to the parent, and end with it."""
     # Python sets a handler in the main thread alone.
     if threading.current_thread() is threading.main_thread():
@@ -207,15 +207,15 @@ def begin(parent: int) -> None:
     follow_parent(parent)
 
 
-def _with_key(key: Key, item: Item[Result]) -> tuple[Key, Report[Result]]:
+def _with_key(key: Key, item: Item[Outcome]) -> tuple[Key, Report[Outcome]]:
     return key, perform(item)
 
 
 def _reports(
-    items: Mapping[Key, Item[Result]],
+    items: Mapping[Key, Item[Outcome]],
     jobs: int,
     scheduler: str | None,
-) -> Generator[tuple[Key, Report[Result]], None, None]:
+) -> Generator[tuple[Key, Report[Outcome]], None, None]:
     """Reports of items by key, in no certain order."""
     if scheduler is not None:
         yield from _on_cluster(scheduler, items)
@@ -226,7 +226,7 @@ def _reports(
     # The workers are as many as the cores: more threads would wait for each other.
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     workers = loky.ProcessPoolExecutor(
-        min(jobs, len(items)), initializer=begin, initargs=(os.getpid(),), env=one_thread
+        min(jobs, len(items)), initializer=begin_worker, initargs=(os.getpid(),), env=one_thread
     )
     try:
         with without_interrupts():
@@ -238,8 +238,8 @@ def _reports(
 
 
 def _on_cluster(
-    address: str, items: Mapping[Key, Item[Result]]
-) -> Iterator[tuple[Key, Report[Result]]]:
+    address: str, items: Mapping[Key, Item[Outcome]]
+) -> Iterator[tuple[Key, Report[Outcome]]]:
     """Run items on an existing scheduler's workers; yield their reports as they end.
 
     Raises EvaluationError where the scheduler fails, is silent or has no worker, and where a worker
@@ -309,9 +309,9 @@ def _identity(dask: Any, address: str) -> dict[str, Any]:
     return _in_a_thread(lambda: asyncio.run(ask()))
 
 
-def _in_a_thread(function: Callable[[], Result]) -> Result:
+def _in_a_thread(function: Callable[[], Outcome]) -> Outcome:
     """Call a function in a thread of its own: a notebook's has an event loop that runs already."""
-    results: list[Result] = []
+    results: list[Outcome] = []
     errors: list[BaseException] = []
 
     def call() -> None:

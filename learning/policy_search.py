@@ -15,7 +15,7 @@ from cosim.core.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, GreedyConfiguration, Positive
-from learning.step import HESSIANS, update_without_fit
+from learning.step import HESSIAN_BLOCKS, update_without_fit
 
 
 class PolicySearchConfiguration(GreedyConfiguration):
@@ -61,7 +61,7 @@ class Coordinates:
         span = np.where(np.isfinite(span), span, np.abs(scenario.reference_state))
         states = width * np.where(span > 0, span, 1.0)
         actions = width * (scenario.action_upper - scenario.action_lower)
-        self._factors = {name: np.linalg.cholesky(start[name]) for name in HESSIANS}
+        self._factors = {name: np.linalg.cholesky(start[name]) for name in HESSIAN_BLOCKS}
         self._units = {
             "B_Vf": np.ones(start.blocks.block("B_Vf").size),
             "b_Vf": states,
@@ -82,7 +82,7 @@ class Coordinates:
             # Each block takes its own coordinates off the vector.
             delta = unit * z[first : first + unit.size]
             first += unit.size
-            if name in HESSIANS:
+            if name in HESSIAN_BLOCKS:
                 symmetric = start.blocks.block(name).unpack(delta)
                 matrix = self._factors[name] @ expm(symmetric) @ self._factors[name].T
                 values[name] = (matrix + matrix.T) / 2

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.export.core import SOURCES, core
+from controllers.export.core import ENGINE_SOURCES, core
 from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
@@ -63,7 +63,7 @@ class Rollout:
             "sizes.h": c_definitions(sizes),
             # Where a function says that it is exported, Windows exports no other.
             "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
-            "loop.h": (SOURCES / "loop.h").read_bytes(),
+            "loop.h": (ENGINE_SOURCES / "loop.h").read_bytes(),
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
         path = library(sources)

@@ -22,7 +22,7 @@ from learning.checkpoint import State
 from learning.configuration import Configuration
 from learning.errors import DivergenceError
 
-HESSIANS = ("B_l", "B_Vf")
+HESSIAN_BLOCKS = ("B_l", "B_Vf")
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def smallest_eigenvalue(blocks: ThetaBlocks, theta: Vector) -> float:
     """
     # One number for both blocks: the smaller of their least eigenvalues.
     least = np.inf
-    for name in HESSIANS:
+    for name in HESSIAN_BLOCKS:
         eigenvalues = np.linalg.eigvalsh(matrix_of(blocks, theta, name))
         least = min(least, float(eigenvalues[0]))
     return least
@@ -192,7 +192,7 @@ def definite(
     matrices = []
     offsets = []
     cones = []
-    for name in HESSIANS:
+    for name in HESSIAN_BLOCKS:
         block = blocks.block(name)
         where = blocks.slices[name]
         size = block.shape[0]
@@ -238,7 +238,7 @@ def clip_eigenvalues(
         The new θ, (n_θ,).
     """
     theta = theta.copy()
-    for name in HESSIANS:
+    for name in HESSIAN_BLOCKS:
         matrix = matrix_of(blocks, theta, name)
         values, vectors = np.linalg.eigh(matrix)
         if values[0] < smallest:

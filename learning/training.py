@@ -35,9 +35,9 @@ from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.evaluator import Evaluator
-from learning.log import COLUMNS, METRICS, LogRow, to_csv
+from learning.log import LOG_COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
-from learning.training_run import HELD_OUT, TrainingRun, begin, make_run
+from learning.training_run import HELD_OUT, TrainingRun, begin_training, make_run
 from learning.verdict import WORSE, Verdict, verdict
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ CHECKPOINT = "checkpoint.npz"
 FIGURE = "learning.png"
 LOG = "learning.csv"
 PARAMETERS = "parameters.toml"
-FILES = (
+TRAINING_FILES = (
     CHECKPOINT, LOG, PARAMETERS, FIGURE, "learning.gif", "summary.json", "scenario.toml",
     "training.rrd",
 )  # fmt: skip
@@ -451,7 +451,7 @@ class _Session:
         self.plant = plant
         self.out = out
         self.identity = run.identity()
-        self.loop = begin(run, algorithm, plant)
+        self.loop = begin_training(run, algorithm, plant)
         self.start = self.loop.start_parameters
         self.rows: list[LogRow] = []
         # Since the last row:
@@ -492,7 +492,7 @@ class _Session:
 
     def first_row(self, evaluator: Evaluator) -> LogRow:
         """The line of the log before the first sample: the start, evaluated."""
-        metrics = dict.fromkeys(COLUMNS, float("nan"))
+        metrics = dict.fromkeys(LOG_COLUMNS, float("nan"))
         counts = dict.fromkeys(asdict(self.loop.counts), 0)
         counts.pop("number")
         metrics |= {"samples": 0, "plant_samples": 0, **counts}
@@ -514,7 +514,7 @@ class _Session:
         for update in updates:
             smallest = min(update.smallest_eigenvalue, smallest)
         counts = asdict(self.loop.counts)
-        metrics = dict.fromkeys(COLUMNS, float("nan"))
+        metrics = dict.fromkeys(LOG_COLUMNS, float("nan"))
         metrics["samples"] = number
         metrics["updates"] = len(updates)
         metrics["J"] = _total(self.costs) / n_costs
@@ -554,7 +554,7 @@ class _Session:
         if self.out is None:
             return
         # Nothing of another run may stay beside the files of this one.
-        with staged(self.out, FILES) as stage:
+        with staged(self.out, TRAINING_FILES) as stage:
             write_atomically(stage / LOG, to_csv(self.rows))
             self.loop.parameters.save(stage / PARAMETERS)
             self._save_state(stage / CHECKPOINT)
@@ -592,7 +592,7 @@ class _Session:
         """Put log, plant and loop back as a checkpoint has them."""
         self.rows = []
         for values, theta in zip(state["rows"].tolist(), state["row_thetas"], strict=True):
-            metrics = dict(zip(COLUMNS, values, strict=True))
+            metrics = dict(zip(LOG_COLUMNS, values, strict=True))
             self.rows.append(LogRow(metrics, self.start.with_theta(theta)))
         self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
         self.loop.load_state_dict(part_of(state, "loop"))

@@ -239,7 +239,7 @@ def _fitting_log_interval(evaluate_every: int | None, checkpoint_every: int | No
     return interval
 
 
-def begin(
+def begin_training(
     run: TrainingRun,
     algorithm: type[Algorithm],
     plant: FmuPlant,

@@ -20,7 +20,7 @@ from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.scenario import Scenario
 
-SOURCES = Path(__file__).parent / "sources"
+ENGINE_SOURCES = Path(__file__).parent / "sources"
 QP_SOURCES = ("qp.h", "qp_enter.h", "qp_refine.h", "qp_residual.h", "qp_set.h")
 # The files of each solver of a sample's QP; the first is what `rti.h` includes.
 CONDENSED_SOLVER = ("condensed.h", *QP_SOURCES)
@@ -94,7 +94,7 @@ def controller_sources(functions: SampleFunctions, *, stagewise: bool = False) -
     """
     solver_files = STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER
     names = ["core.h", "rti.h", *solver_files, "costs.h", "rotation.h", functions.hessian.source]
-    sources = {name: (SOURCES / name).read_bytes() for name in names}
+    sources = {name: (ENGINE_SOURCES / name).read_bytes() for name in names}
     # The preparation's graph maps the stage's function and is written by hand; stage by stage
     # nothing is condensed, so that no condensed vectors are embedded.
     unused = {"PREPARED", "EMBEDDED"} if stagewise else {"PREPARED"}
@@ -207,7 +207,7 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
     return _filled(
         "problem.h.in",
         sizes="\n".join(f"    {name} = {value}," for name, value in sizes.items()),
-        arrays="\n".join(_array(name, values) for name, values in arrays.items()),
+        arrays="\n".join(_array_text(name, values) for name, values in arrays.items()),
         end_discount=repr(float(problem.discounts[-1])),
         floor=repr(Exact.FLOOR),
         residual=repr(SOLVED_RESIDUAL),
@@ -220,10 +220,10 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
 
 
 def _filled(template: str, **values: str) -> str:
-    return Template((SOURCES / template).read_text(encoding="utf-8")).substitute(values)
+    return Template((ENGINE_SOURCES / template).read_text(encoding="utf-8")).substitute(values)
 
 
-def _array(name: str, values: ArrayLike) -> str:
+def _array_text(name: str, values: ArrayLike) -> str:
     numbers = ", ".join(_number(value) for value in np.asarray(values, dtype=np.float64))
     return f"static const double {name}[] = {{{numbers}}};"
 
@@ -234,7 +234,7 @@ def _number(value: float) -> str:
     return "INFINITY" if value > 0 else "-INFINITY"
 
 
-TEMPLATES = Path(__file__).parent / "plain"
+PLAIN_TEMPLATES = Path(__file__).parent / "plain"
 
 _INCLUDE = re.compile(r'^[ \t]*#include "(?P<name>[\w.]+)"[ \t]*\n', re.MULTILINE)
 _C_NAME = re.compile(r"[A-Za-z]\w*")
@@ -298,7 +298,7 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
     }
     names = {"controller.c": f"{name}.c", "controller.h": f"{name}.h"}
     files = {}
-    for path in sorted(TEMPLATES.iterdir()):
+    for path in sorted(PLAIN_TEMPLATES.iterdir()):
         text = Template(path.read_text(encoding="utf-8")).substitute(values)
         if single and path.suffix in (".c", ".h"):
             for pattern, replacement in _SINGLE:

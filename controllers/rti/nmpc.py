@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ControllerError, ModelWarning, ParameterError, QpError, warn
 from controllers.export.core import (
-    SOURCES,
+    ENGINE_SOURCES,
     STACK_LIMIT,
     STATUSES,
     controller_sources,
@@ -461,7 +461,7 @@ class Engine:
         sources = controller_sources(functions, stagewise=stagewise)
         # Beside what is exported, the engine has derivatives and closed loops.
         for name in ("sensitivities.h", "loop.h", "engine.c"):
-            sources[name] = (SOURCES / name).read_bytes()
+            sources[name] = (ENGINE_SOURCES / name).read_bytes()
         path = library(sources)
         return None if path is None else cls(str(path), functions, stagewise)
 
@@ -1085,13 +1085,15 @@ class RtiNmpc:
         guess = self._guess()
         given = guess if points is None else points
         batch = _Batch(
-            _rows("states", states, count, (n,)),
-            None if enforced is None else _rows("actions", enforced, count, (problem.n_actions,)),
-            _rows("θ", self.theta if theta is None else theta, count, self.theta.shape),
+            _batch_rows("states", states, count, (n,)),
+            None
+            if enforced is None
+            else _batch_rows("actions", enforced, count, (problem.n_actions,)),
+            _batch_rows("θ", self.theta if theta is None else theta, count, self.theta.shape),
             LinearisationPoint(
-                x=_rows("points", given[0], count, guess.x.shape),
-                u=_rows("points", given[1], count, guess.u.shape),
-                costates=_rows("points", given[2], count, guess.costates.shape),
+                x=_batch_rows("points", given[0], count, guess.x.shape),
+                u=_batch_rows("points", given[1], count, guess.u.shape),
+                costates=_batch_rows("points", given[2], count, guess.costates.shape),
             ),
             derivatives=derivatives,
         )
@@ -1152,7 +1154,7 @@ def _alike(one: Vector, other: Vector) -> bool:
     return bool(np.allclose(one, other, rtol=0.0, atol=1e-9 * size, equal_nan=True))
 
 
-def _rows(kind: str, values: ArrayLike, count: int, shape: tuple[int, ...]) -> Vector:
+def _batch_rows(kind: str, values: ArrayLike, count: int, shape: tuple[int, ...]) -> Vector:
     rows = np.asarray(values, dtype=np.float64)
     if rows.shape not in (shape, (count, *shape)):
         raise ControllerError(f"the {kind} must have shape {(count, *shape)}, not {rows.shape}")

@@ -43,7 +43,7 @@ def evaluate(
     with cli.output(json) as out_:
         from loky import cpu_count
 
-        from cosim.evaluation import FILES, named_controllers
+        from cosim.evaluation import EVALUATION_FILES, named_controllers
 
         task = cosim.Scenario.load(scenario)
         if trajectories is not None:
@@ -66,7 +66,7 @@ def evaluate(
             command=shlex.join(["cosim", "evaluate", *words]),
         )
         summary = evaluation.summary()
-        with staged(folder, FILES) as stage:
+        with staged(folder, EVALUATION_FILES) as stage:
             evaluation.write_files(stage)
             cli.write_summary(stage, summary)
         show_evaluation(summary, out_)
@@ -78,7 +78,7 @@ def _evaluate_trajectories(
     scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output
 ) -> None:
     from cosim.core.statistics import mean, regret, shown
-    from cosim.evaluation import FILES, judge
+    from cosim.evaluation import EVALUATION_FILES, judge
 
     table = judge(scenario, trajectories)
     cost, optimum = table["J"].to_numpy(), table["optimum"].to_numpy()
@@ -94,7 +94,7 @@ def _evaluate_trajectories(
         "regret": regret(cost, optimum)._asdict(),
         "violating_share": float(table["violating_share"].mean()),
     }
-    with staged(folder, FILES) as stage:
+    with staged(folder, EVALUATION_FILES) as stage:
         write_atomically(stage / "judged.csv", table.to_csv(index=False))
         cli.write_summary(stage, summary)
     output.table("judged runs", ("file", "seed", "steps", "J", "regret %"), rows)

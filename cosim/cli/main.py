@@ -33,7 +33,7 @@ from cosim.core.errors import CosimError, CosimWarning
 from cosim.core.files import protect
 from cosim.core.processes import Interrupted, Terminated, command_process, unwound
 
-OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
+OUTPUT_OPTIONS = ("--out", "-o", "--png", "--ssp", "--record")
 """Options whose value is an output path."""
 
 OPTIONS_OF_PANELS = {
@@ -68,7 +68,7 @@ class _Commands(TyperGroup):
                 name = name or (before if before.startswith("-") else "")
                 what = f"the value of '{name}'" if name else "an argument"
                 raise CosimError(f"{what} is empty: give one, or leave it out")
-            if not {before, name} & set(OUTPUTS):
+            if not {before, name} & set(OUTPUT_OPTIONS):
                 inputs += [word, *re.split("[,=]", word)]
         protect(inputs)
         if ctx.resilient_parsing or {"-h", "--help"} & {*args}:  # completion says what help says
@@ -108,21 +108,29 @@ app = typer.Typer(
     epilog="Example: cosim demo --out demo",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-RUN = "Run, look and compare"
+RUN_PANEL = "Run, look and compare"
 LEARN = "Learn"
 BUILD = "Build and hand over"
 for panel, function, example in (
-    (RUN, demo.demo, "demo --out demo"),
-    (RUN, simulate.simulate, "simulate --scenario paper --controller tuned --steps 500 --record"),
-    (RUN, evaluate.evaluate, "evaluate --scenario fouled --controllers naive,tuned --seeds 10"),
+    (RUN_PANEL, demo.demo, "demo --out demo"),
+    (
+        RUN_PANEL,
+        simulate.simulate,
+        "simulate --scenario paper --controller tuned --steps 500 --record",
+    ),
+    (
+        RUN_PANEL,
+        evaluate.evaluate,
+        "evaluate --scenario fouled --controllers naive,tuned --seeds 10",
+    ),
     (LEARN, train.train, "train --algorithm q-learning --samples 20000 --out learnt"),
-    (RUN, view.view, "view cosim-run/run.rrd --png run.png"),
-    (RUN, compare.compare, "compare cosim-run other-run --relative 1e-9"),
+    (RUN_PANEL, view.view, "view cosim-run/run.rrd --png run.png"),
+    (RUN_PANEL, compare.compare, "compare cosim-run other-run --relative 1e-9"),
     (LEARN, optimum.optimum, "optimum --scenario paper"),
     (LEARN, optimum.tuning, "tuning --scenario paper --out tuned.toml"),
     (BUILD, new.new, "new rule my_rule"),
     (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
-    (RUN, study.reproduce, "reproduce --budget quick --out reproduction"),
+    (RUN_PANEL, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
     text, epilog = _documentation(function)[0], f"Example: cosim {example}"
     app.command(rich_help_panel=panel, help=text, epilog=epilog)(function)

@@ -12,7 +12,7 @@ import cosim
 from cosim.cli import output as cli
 
 if TYPE_CHECKING:
-    from controllers.dynamic_programming import Optimum, Progress
+    from controllers.dynamic_programming import Optimum, RoundProgress
     from controllers.optimum import QuasiStaticPolicy
 
 
@@ -72,7 +72,7 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cl
 def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
-    from controllers.dynamic_programming import Estimate, Settings, certify, objection, solve
+    from controllers.dynamic_programming import GainEstimate, Settings, certify, objection, solve
     from controllers.problem import PlantProblem
 
     plant, settings = PlantProblem.from_scenario(task), Settings()
@@ -86,7 +86,9 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     certificate = solution.certificate
     why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
     kind = "reference" if why_not else "optimum"
-    figures = certificate or [Estimate("solution", solution.gain, solution.lower, solution.upper)]
+    figures = certificate or [
+        GainEstimate("solution", solution.gain, solution.lower, solution.upper)
+    ]
     rows = [(name, *(f"{x:.4f}" for x in numbers)) for name, *numbers in figures]
     states = " × ".join(map(str, solution.grid.shape))
     title = f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states"
@@ -108,7 +110,7 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     }
 
 
-def _show_rounds(out_: cli.Output) -> Progress:
+def _show_rounds(out_: cli.Output) -> RoundProgress:
     """Note each round on a terminal: the grid and the closing bounds."""
 
     def note(level: int, number: int, solution: Optimum) -> None:

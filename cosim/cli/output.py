@@ -104,9 +104,9 @@ class Output:
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, unless it is a shipped one."""
-        from cosim.plant.fmi import SHIPPED, unpack
+        from cosim.plant.fmi import SHIPPED_FMUS, unpack
 
-        if fmu not in SHIPPED:
+        if fmu not in SHIPPED_FMUS:
             unpacked = unpack(fmu)
             self.note(f"native code of {unpacked.path}, sha256 {unpacked.sha256}")
 

@@ -123,7 +123,7 @@ def draft(
             state=_numbers(state, "--state"),
             action=_numbers(action, "--action"),
         )
-        drafted = _parsed(text, target)
+        drafted = _parsed_scenario(text, target)
         if drafted.controller.model is not None:
             text = _with_enough_substeps(text, drafted)
         write_atomically(target, text)
@@ -136,7 +136,7 @@ def draft(
         out_.json({"file": str(target), **drafted.to_dict(), "hash": drafted.hash})
 
 
-def _parsed(text: str, target: Path) -> cosim.Scenario:
+def _parsed_scenario(text: str, target: Path) -> cosim.Scenario:
     """The scenario of a file that is not written yet."""
     from tomllib import loads
 

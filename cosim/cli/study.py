@@ -141,12 +141,12 @@ def _summary(results: cosim.StudyResults) -> dict[str, Any]:
 
 def _show_tables(results: cosim.StudyResults, out_: cli.Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
-    from cosim.studies.report import COLUMNS, SHORT
+    from cosim.studies.report import REPORT_COLUMNS, SHORT_COLUMNS
 
     if columns is None:
-        names = list(SHORT)
+        names = list(SHORT_COLUMNS)
     elif columns == "all":
-        names = list(COLUMNS)
+        names = list(REPORT_COLUMNS)
     else:
         names = columns.split(",")
     for scenario in results.scenarios:
@@ -217,7 +217,7 @@ def check_results(
             for name in chosen:
                 now = work / name
                 _execute(folder / f"{name}.toml", now, out_, jobs=jobs, figures=False)
-                differences[name] = stored.differences(name, folder / name, now, tolerances)
+                differences[name] = stored.table_differences(name, folder / name, now, tolerances)
         rows = []
         for name in studies:
             verdict = "not recomputed"

@@ -67,7 +67,7 @@ def train(
         from controllers.optimum import stored_optimum
         from cosim.core.files import staged
         from learning.algorithm import load_algorithm
-        from learning.training import CHECKPOINT, FILES, run_training
+        from learning.training import CHECKPOINT, TRAINING_FILES, run_training
         from learning.training_run import make_run
         from learning.verdict import WORSE
 
@@ -92,7 +92,7 @@ def train(
             rest_after=rest_after,
         )
         folder = cli.open_folder(out)
-        there = [name for name in FILES if (folder / name).exists()]
+        there = [name for name in TRAINING_FILES if (folder / name).exists()]
         if there and not (resume or overwrite):
             raise CosimError(
                 f"folder '{folder}' holds another training ({there[0]}); go on with it by "
@@ -112,7 +112,7 @@ def train(
             out_.note(f"left no checkpoint, --resume is not possible: {reason}")
         timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
         summary = training.summary() | {"timing": timing}
-        with staged(folder, set(FILES) - {CHECKPOINT}) as stage:
+        with staged(folder, set(TRAINING_FILES) - {CHECKPOINT}) as stage:
             training.write_files(stage)
             if gif:
                 training.animate(stage / "learning.gif")

@@ -61,7 +61,7 @@ def training_figure(
     share, error = _known(log, "greedy_violating_share"), _known(log, "td_error")
     moved = _most_moved(theta)
     panels: dict[str, Callable[[Axes], Sequence[EndLabel]]] = {
-        "regret %" if best is not None else "J per sample": lambda axes: _cost(
+        "regret %" if best is not None else "J per sample": lambda axes: _draw_cost(
             axes, log, baselines, best
         )
     }
@@ -107,7 +107,7 @@ def _known(log: Mapping[str, Array], name: str) -> tuple[Array, Array]:
     return log["samples"][known], values[known]
 
 
-def _cost(
+def _draw_cost(
     axes: Axes,
     log: Mapping[str, Array],
     baselines: Mapping[str, float],

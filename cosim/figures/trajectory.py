@@ -33,11 +33,13 @@ from cosim.figures.style import (
 
 FRAME = 350
 """Milliseconds of an animation's frame."""
-Run = Any
+DrawnRun = Any
 """A `cosim.core.trajectory.Trajectory`, which imports this module."""
 
 
-def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[Run] = ()) -> Figure:
+def trajectory_figure(
+    trajectory: DrawnRun, scenario: Scenario, *, beside: Sequence[DrawnRun] = ()
+) -> Figure:
     """States and inputs with bounds (red) and operating point (grey), disturbances and costs.
 
     States and inputs have the controller's colour; inputs, disturbances and costs hold from one
@@ -72,7 +74,7 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
             color = costs.get(name, REFERENCE)
             panels[name].step(time, trajectory[name], where="post", color=color, linewidth=0.6)
         for name in costs:
-            _mean(panels[name], float(np.mean(trajectory[name])))
+            _draw_mean(panels[name], float(np.mean(trajectory[name])))
         panels["penalty"].set_ylim(bottom=0.0)
         for names in (left, right):
             panels[names[-1]].set_xlabel(f"time [{unit}]")
@@ -84,7 +86,7 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
 
 
 def _loop_panels(
-    panels: Mapping[str, Axes], time: Array, trajectory: Run, scenario: Scenario
+    panels: Mapping[str, Axes], time: Array, trajectory: DrawnRun, scenario: Scenario
 ) -> None:
     """Draw states and inputs, their bounds and operating point, and fallback actions."""
     controller = trajectory.controller or "run"
@@ -102,7 +104,7 @@ def _loop_panels(
             axes.legend(loc="upper right")
 
 
-def _mean(axes: Axes, mean: float) -> None:
+def _draw_mean(axes: Axes, mean: float) -> None:
     """Draw a mean as a dotted line, and its number in the corner."""
     axes.axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
     axes.annotate(
@@ -116,7 +118,7 @@ def _mean(axes: Axes, mean: float) -> None:
     )
 
 
-def _title(trajectory: Run, scenario: Scenario) -> str:
+def _title(trajectory: DrawnRun, scenario: Scenario) -> str:
     summary = trajectory.summary()
     seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
     return (
@@ -126,7 +128,7 @@ def _title(trajectory: Run, scenario: Scenario) -> str:
     )
 
 
-def overlay_figure(runs: Mapping[str, Run]) -> Figure:
+def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
     """States and inputs of runs of one scenario over time, a line for each controller.
 
     Below a violated lower bound, and above an upper one, the area is shaded in the controller's
@@ -158,7 +160,9 @@ def overlay_figure(runs: Mapping[str, Run]) -> Figure:
     return drawn
 
 
-def animation(start: str, first: Run, name: str, runs: Mapping[str, Run], path: str | Path) -> Path:
+def animation(
+    start: str, first: DrawnRun, name: str, runs: Mapping[str, DrawnRun], path: str | Path
+) -> Path:
     """Write a GIF: a frame for each run, drawn over the first one on the same axes.
 
     Args:
@@ -255,7 +259,7 @@ def time_unit(time: Array) -> tuple[float, str]:
 
 
 def _line(
-    axes: Axes, time: Array, run: Run, name: str, color: str, width: float, shade: str
+    axes: Axes, time: Array, run: DrawnRun, name: str, color: str, width: float, shade: str
 ) -> None:
     """Draw a state, or an input, which is held, and shade what is beyond its bounds."""
     values = run[name]

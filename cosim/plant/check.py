@@ -12,9 +12,9 @@ import fmus
 from cosim.core.errors import CosimError, PlantError
 from cosim.core.scenario import Scenario
 from cosim.plant.draft import first_document, guess_roles, number_roles
-from cosim.plant.fmi import DESCRIPTION, SHIPPED, UnpackedFmu, number, unpack
+from cosim.plant.fmi import DESCRIPTION, SHIPPED_FMUS, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.probe import AFTER, Report, Row, probe
+from cosim.plant.probe import AFTER, ProbeReport, Row, probe
 from cosim.plant.starts import start_parameters
 from cosim.plant.wiring import REALS, refusals
 from fmus import FmuError
@@ -44,7 +44,7 @@ class PlantCheck:
     verdict: str
     rows: tuple[Row, ...]
     remarks: tuple[str, ...] = ()
-    report: Report | None = None
+    report: ProbeReport | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The same as numbers, words and lists, for JSON."""
@@ -94,7 +94,7 @@ def check_plant(
     Raises:
         CosimError: The file is missing or is no FMU, or a name is not one of its variables.
     """
-    path = (fmus.path(str(fmu)) if str(fmu) in SHIPPED else Path(fmu)).absolute()
+    path = (fmus.path(str(fmu)) if str(fmu) in SHIPPED_FMUS else Path(fmu)).absolute()
     _require_fmu(path)
     # From here on an FMU that cannot be a plant is an answer, and no error.
     try:
@@ -217,7 +217,7 @@ def _step_size(archive: UnpackedFmu, step: float) -> Row:
     return Row("step size", ", ".join(words), follows)
 
 
-def _probe_rows(report: Report) -> list[Row]:
+def _probe_rows(report: ProbeReport) -> list[Row]:
     """The probe's rows; that of the outputs with their names by kind, its start state left out."""
     by_kind: dict[str, list[str]] = {}
     for name, kind in report.kinds.items():
@@ -254,7 +254,7 @@ def _run_row(scenario: Scenario) -> Row:
     return Row("run", f"{SAMPLES} steps, all numbers finite", f"then the states are {shown}")
 
 
-def _verdict(report: Report) -> str:
+def _verdict(report: ProbeReport) -> str:
     words = ["it can be a plant"]
     if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
         words.append('its outputs are read after the step (plant.outputs = "after-step")')

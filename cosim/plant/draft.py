@@ -19,9 +19,9 @@ from cosim.core.errors import PlantError
 from cosim.core.protocols import Array
 from cosim.core.scenario import Scenario
 from cosim.core.validation import suggestion
-from cosim.plant.fmi import SHIPPED, UnpackedFmu, number, unpack
+from cosim.plant.fmi import SHIPPED_FMUS, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.probe import AFTER, OutputKind, Report, Restart, probe
+from cosim.plant.probe import AFTER, OutputKind, ProbeReport, Restart, probe
 from cosim.plant.starts import candidates, start_parameters
 from cosim.plant.wiring import INTEGERS, NO_NUMBERS, REALS, refusals
 
@@ -187,7 +187,7 @@ def draft_scenario(
     document["penalty"]["linear"] = [weight] * len(x)
     document["plant"]["initial_state"] = x.tolist()
     document["controller"] = _reference(x, u, cost)
-    if str(fmu) in SHIPPED:
+    if str(fmu) in SHIPPED_FMUS:
         document["controller"]["model"] = f"controllers.{str(fmu).removesuffix('_fmi3')}:model"
     else:
         # A file on another drive keeps its absolute path.
@@ -230,7 +230,7 @@ def first_document(
         disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
         for field in ("nominal", "ranges"):
             disturbance[field] = [start_value(archive, name) for name in mapping[field]]
-    is_shipped = str(fmu) in SHIPPED
+    is_shipped = str(fmu) in SHIPPED_FMUS
     return {
         "schema": 1,
         "name": str(fmu) if is_shipped else archive.path.stem,
@@ -297,7 +297,7 @@ def _with_what_was_seen(
     return document | {"plant": plant}, remarks
 
 
-def _actions_remark(report: Report, archive: UnpackedFmu) -> str:
+def _actions_remark(report: ProbeReport, archive: UnpackedFmu) -> str:
     """Which actions move no state, and what may be why."""
     nothing = [name for name, moves_output in report.still.items() if not moves_output]
     alone = f", no output either by {', '.join(nothing)}," if nothing else ""
@@ -309,7 +309,7 @@ def _actions_remark(report: Report, archive: UnpackedFmu) -> str:
     )
 
 
-def _inputs_remark(report: Report) -> str:
+def _inputs_remark(report: ProbeReport) -> str:
     """Which inputs nobody drives."""
     pairs = [f"{name} = {start or '?'}" for name, start in report.undriven.items()]
     more = f" and {len(pairs) - INPUTS_SHOWN} more" if len(pairs) > INPUTS_SHOWN else ""
@@ -317,7 +317,7 @@ def _inputs_remark(report: Report) -> str:
     return f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
 
 
-def _outputs_remark(report: Report) -> str:
+def _outputs_remark(report: ProbeReport) -> str:
     """What is known of the outputs that doStep computes."""
     ends = [name for name, kind in report.kinds.items() if kind is OutputKind.END]
     if not ends:

@@ -40,7 +40,7 @@ from cosim.core.errors import CapabilityError, FmuWarning, PlantError
 from cosim.core.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
 
-SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
+SHIPPED_FMUS = (*fmus.NAMES, *fmus.PLANTS)
 DESCRIPTION = "modelDescription.xml"
 MAX_ENTRIES = 20_000
 MAX_BYTES = 1 << 30
@@ -144,10 +144,11 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
     An FMU is native code that runs with the caller's rights, so a foreign one is taken only from
     the very path given. Raises PlantError on a missing, corrupt or suspicious archive.
     """
-    path = fmus.path(str(fmu)) if str(fmu) in SHIPPED else Path(fmu)
+    path = fmus.path(str(fmu)) if str(fmu) in SHIPPED_FMUS else Path(fmu)
     if path.suffix != ".fmu" and len(path.parts) == 1:
         raise PlantError(
-            f"unknown FMU '{fmu}'; shipped are {', '.join(SHIPPED)}, or give the path of an .fmu"
+            f"unknown FMU '{fmu}'; shipped are {', '.join(SHIPPED_FMUS)}, or give the path of an "
+            ".fmu"
         )
     try:
         path = path.resolve()
@@ -381,7 +382,7 @@ def _instead(
 
 
 WARNING, DISCARD, FATAL = 1, 2, 4
-_STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
+_STATUS_WORDS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 _alive: Counter[str] = Counter()
 
@@ -472,7 +473,7 @@ class Native(ctypes.Structure):
     ]
 
 
-NOT_FINITE = 5
+NOT_FINITE_STATUS = 5
 """Fault of a compiled loop: an output or state is not finite; lower numbers: a call of FMI."""
 
 
@@ -946,7 +947,7 @@ class Instance(ABC):
             status: what it returned.
         """
         self.fatal |= status == FATAL
-        label = _STATUS.get(status, f"status {status}, which FMI does not have")
+        label = _STATUS_WORDS.get(status, f"status {status}, which FMI does not have")
         raise PlantError(
             f"FMU '{self.fmu.path.name}': {self.prefix}{function} returned {label}{self._log()}"
         )

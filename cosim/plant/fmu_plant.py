@@ -15,7 +15,7 @@ import numpy as np
 from cosim.core.errors import CapabilityError, PlantError
 from cosim.core.protocols import Array, CompiledLoop, Step
 from cosim.core.scenario import Scenario
-from cosim.plant.fmi import NOT_FINITE, Instance, Intermediate, unpack
+from cosim.plant.fmi import NOT_FINITE_STATUS, Instance, Intermediate, unpack
 from cosim.plant.probe import Restart, as_asked, probe_of, subject_of
 from cosim.plant.wiring import Wiring, refusals, seed_words
 
@@ -297,7 +297,7 @@ class FmuPlant:
                 if k < change < stop:
                     stop = change
             k, fault, status = loop(fmi.native, k, table[k - first : stop - first])
-            if fault == NOT_FINITE:
+            if fault == NOT_FINITE_STATUS:
                 self._refuse_output(k)
             if fault:
                 fmi.fail_native(fault, status)

@@ -70,7 +70,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Report:
+class ProbeReport:
     """What was found out about an FMU as a plant.
 
     Attributes:
@@ -405,7 +405,7 @@ def _all_numbers(part: ProbedRun | Sequence[ProbedStep]) -> list[float]:
 
 GENTLE = 0.02
 """Share of the distance by which inputs vary where an FMU failed under the whole of it."""
-SHORT = 2.0**-14
+SHORT_STEP = 2.0**-14
 """A short step, as a share of a step: what is continuous has hardly moved."""
 HARDLY = 0.05
 """How far an output may move in a short step, as a share of its move in a step."""
@@ -684,7 +684,7 @@ class Probe:
 
         try:
             half = under(self._inputs[k], step / 2)
-            short = (under(self._low, step * SHORT), under(self._high, step * SHORT))
+            short = (under(self._low, step * SHORT_STEP), under(self._high, step * SHORT_STEP))
         except PlantError:
             bench.instantiate()
             return None
@@ -860,7 +860,7 @@ def probe(
     outputs: Sequence[str] = (),
     states: Sequence[str] = (),
     step: float | None = None,
-) -> Report:
+) -> ProbeReport:
     """Find out whether an FMU can be a plant, and how.
 
     Args:
@@ -903,7 +903,7 @@ def _undriven_inputs(subject: Subject) -> dict[str, str]:
     return undriven
 
 
-def _report(seen: Probe, starts_anywhere: bool) -> Report:
+def _report(seen: Probe, starts_anywhere: bool) -> ProbeReport:
     subject = seen.subject
     findings = seen.findings
     fmu = subject.fmu
@@ -937,7 +937,7 @@ def _report(seen: Probe, starts_anywhere: bool) -> Report:
         )
     if findings.failure:
         rows.append(Row("failure", findings.failure, "what it left open is taken as not possible"))
-    return Report(
+    return ProbeReport(
         fmu=fmu.path,
         sha256=fmu.sha256,
         rows=tuple(rows),

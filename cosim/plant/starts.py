@@ -10,7 +10,7 @@ from cosim.core.scenario import Scenario
 from cosim.plant.fmi import Order, Reading, UnpackedFmu, number
 from cosim.plant.wiring import REALS, Wiring, has_start
 
-WORDS = ("start", "init", "initial", "ini", "initialvalue", "startvalue", "t0", "0")
+START_WORDS = ("start", "init", "initial", "ini", "initialvalue", "startvalue", "t0", "0")
 """What tools add to a state's name: `c_start` (Modelica), `T0` (20-sim), `x_initial`, `xInit`."""
 PROBED = 1e-3
 """Share of a state's scale by which a probe moves its start."""
@@ -58,7 +58,7 @@ def candidates(fmu: UnpackedFmu, state: str) -> Iterator[str]:
     """Names of variables that may set a state's start, the likeliest first.
 
     The start of `reactor.medium.T[2]` may be `reactor.medium.T_start[2]`, `reactor.T_start[2]`, or
-    `T_start[2]`, with any of `WORDS`; last comes the state's own start value.
+    `T_start[2]`, with any of `START_WORDS`; last comes the state's own start value.
 
     Args:
         fmu: has the variables.
@@ -76,7 +76,7 @@ def candidates(fmu: UnpackedFmu, state: str) -> Iterator[str]:
     # From the state's own component outwards.
     while True:
         beside = settable.get((path, index), [])
-        for word in WORDS:
+        for word in START_WORDS:
             for name, other_base in beside:
                 if _has_word(other_base, base, word):
                     yield name

@@ -61,7 +61,7 @@ def read_recording(path: str | Path) -> Recording:
             static.setdefault(chunk.entity_path, {}).update(texts)
         elif SAMPLE in batch.schema.names:
             batches[chunk.entity_path].append(batch)
-    rows_of = {entity: _rows(parts) for entity, parts in batches.items()}
+    rows_of = {entity: _stacked_rows(parts) for entity, parts in batches.items()}
     recording = Recording({}, np.empty(0, np.int64), np.empty(0), {}, _properties(static), [], {})
     marked = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
     if not marked:
@@ -169,7 +169,7 @@ def _texts(column: pa.Array) -> list[str]:
     return [str(item) for item in value] if isinstance(value, list) else [str(value)]
 
 
-def _rows(batches: list[pa.RecordBatch]) -> pa.Table:
+def _stacked_rows(batches: list[pa.RecordBatch]) -> pa.Table:
     """Rows of an entity, by sample."""
     table = pa.Table.from_batches(batches)
     return table.take(np.argsort(np.asarray(table[SAMPLE]), kind="stable"))

@@ -141,7 +141,7 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
 
         def answers() -> bool:
             if process.poll() is not None:
-                raise RecordingError(_complaint(log.fileno()))
+                raise RecordingError(_viewer_complaint(log.fileno()))
             with socket.socket() as probe:
                 return probe.connect_ex((LOOPBACK, port)) == 0
 
@@ -149,7 +149,7 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
         try:
             yield ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
         except (ConnectionError, RuntimeError) as error:
-            raise RecordingError(_complaint(log.fileno())) from error
+            raise RecordingError(_viewer_complaint(log.fileno())) from error
 
 
 def _wait(done: Callable[[], bool], deadline: float, task: str) -> None:
@@ -159,7 +159,7 @@ def _wait(done: Callable[[], bool], deadline: float, task: str) -> None:
         time.sleep(0.1)
 
 
-def _complaint(log: int) -> str:
+def _viewer_complaint(log: int) -> str:
     """The reason of the viewer's end, from its log."""
     text = os.pread(log, 1 << 20, 0).decode(errors="replace")
     if any(sign in text for sign in _NO_DRIVER):

@@ -340,14 +340,14 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
             if len(runs) == 2:
                 entity = f"difference/{escaped(signal)}"
                 line = Channel(entity, f"difference/{signal}", of_first.unit, SERIES[3])
-                values = _difference(of_first.values, others[0].signals[signal].values)
+                values = _signal_difference(of_first.values, others[0].signals[signal].values)
                 time = next(iter(time_of.values()))[: len(values)]
                 stream.send([line], times(np.arange(len(values)), time), values)
                 differences.append(view(line.title, [line], along))
         stream.layout = _tabs({title: overlaid, "difference": differences})
 
 
-def _difference(one: Array, other: Array) -> Array:
+def _signal_difference(one: Array, other: Array) -> Array:
     """One signal less the other, (K,), over the K samples that both have."""
     common = min(len(one), len(other))
     with np.errstate(invalid="ignore"):

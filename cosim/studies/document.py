@@ -12,11 +12,11 @@ from cosim.core.files import read_toml
 from cosim.core.scenario import Table
 from cosim.core.validation import SchemaVersion, validated
 
-Count = Annotated[int, Field(ge=1, le=100_000_000)]
+RunCount = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]
-Name = Annotated[str, Field(pattern=r"^\.*[\w+-][\w.+-]*$")]
+StudyName = Annotated[str, Field(pattern=r"^\.*[\w+-][\w.+-]*$")]
 Source = Annotated[str, Field(min_length=1)]
-PerScenario = Count | dict[str, Count]
+PerScenario = RunCount | dict[str, RunCount]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""
 DEFAULT = "default"
 Hour = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -27,7 +27,7 @@ class SeedsTable(Table):
     """Training seeds: `count` of them from `first` on."""
 
     first: Seed = 0
-    count: Count = 10
+    count: RunCount = 10
 
 
 class EvaluationTable(Table):
@@ -46,7 +46,7 @@ class EvaluationTable(Table):
 class CurvesTable(Table):
     """Learning curves: greedy evaluations of θ while training goes on."""
 
-    points: Count = 20
+    points: RunCount = 20
     """Greedy evaluations of each training, evenly over its samples."""
     seeds: PerScenario = 4
     """Held-out runs of each evaluation."""
@@ -76,13 +76,13 @@ class CaseTable(Table):
     takes a list itself, a list of lists does.
     """
 
-    name: Name | None = None
+    name: StudyName | None = None
     """Its name in tables; by default the controller's own."""
     algorithm: Source | None = None
     """A registered algorithm, or `module:Class`."""
     controller: Source | list[Source] | None = None
     """A registered controller, `module:factory` or a parameters file; a list is several cases."""
-    samples: Count | list[Count] = 40_000
+    samples: RunCount | list[RunCount] = 40_000
     """Plant samples of a training."""
     start: Source | list[Source] = "naive"
     """θ at the start: `naive`, `tuned`, `backed-off`, `cautious` or a parameters file."""
@@ -96,7 +96,7 @@ class CaseTable(Table):
     """Those of the study's scenarios that it runs on; all, if left out."""
     training_seeds: SeedsTable | None = None
     """Its own training seeds, in place of the study's."""
-    group: Name | None = None
+    group: StudyName | None = None
     """Panel of the figures that shows it; by default the algorithm's name."""
     title: str = ""
     """A few words for readers."""
@@ -127,11 +127,11 @@ class CaseTable(Table):
 class TrajectoryTable(Table):
     """A table `[[trajectory]]`: one run of each case on the same noise, kept sample by sample."""
 
-    name: Name
+    name: StudyName
     """Its name in files and figures."""
     seed: Seed = 1
     """Noise seed."""
-    steps: Count = 240
+    steps: RunCount = 240
     """Samples of the run."""
     cases: list[Source] | None = None
     """Names of cases; a trained one runs with its first training seed. All, if left out."""
@@ -151,7 +151,7 @@ class StudyTable(Table):
 
     schema_version: Annotated[SchemaVersion, Field(alias="schema")]
     """`schema` in the file: 1."""
-    name: Name
+    name: StudyName
     """The study's name in tables and messages."""
     title: str = ""
     """Heading of the report; the name, if left out."""

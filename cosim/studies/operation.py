@@ -26,7 +26,7 @@ from cosim.plant import FmuPlant
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
 from learning.log import LogRow
-from learning.training_run import TrainingRun, begin
+from learning.training_run import TrainingRun, begin_training
 
 WINDOW = 100
 """Samples in a row of the worst window."""
@@ -98,7 +98,7 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
     with FmuPlant(run.scenario) as plant:
         # What the start's θ costs in the same samples, on the same noise.
         before = _cost_of_the_start(run, plant)
-        loop = begin(run, load_algorithm(run.algorithm), plant)
+        loop = begin_training(run, load_algorithm(run.algorithm), plant)
         clock = process_time()
         compile_functions(loop.controller, run.samples)
         start_theta = loop.controller.theta.copy()

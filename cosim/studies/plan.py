@@ -52,7 +52,7 @@ TRAINING_OPTIONS = (
 """What a case's table `training` may say."""
 GRID_FIELDS = ("samples", "start", "nmpc")
 """Fields of a case, beside its settings, that may be a grid."""
-T = TypeVar("T")
+Choice = TypeVar("Choice")
 SEQUENCES = (list, tuple, set, frozenset)
 
 
@@ -302,7 +302,7 @@ class Study:
             )
         return tuple(samples)
 
-    def _of(self, value: T | dict[str, T], scenario: str, field: str) -> T:
+    def _of(self, value: Choice | dict[str, Choice], scenario: str, field: str) -> Choice:
         if not isinstance(value, dict):
             return value
         _check_known(value, [*self.scenarios, DEFAULT], field, "scenario")
@@ -405,7 +405,7 @@ def plan(study: Study) -> StudyPlan:
         if (case.name, name) not in content:
             content[case.name, name] = _read_content(study, case, name)
         runs.append(_run(study, case, name, seed, content[case.name, name]))
-    _check_names(study)
+    _check_unique_names(study)
     provenance = {
         "versions": versions(),
         "code_hash": code_hash(),
@@ -530,7 +530,7 @@ def _kept(study: Study, case: Case, name: str, seed: int | None) -> dict[str, st
     return kept
 
 
-def _check_names(study: Study) -> None:
+def _check_unique_names(study: Study) -> None:
     """Raise StudyError where a table names a case that is none."""
     names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]

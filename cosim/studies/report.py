@@ -27,7 +27,7 @@ FOLDER = "figures"
 Text = Callable[[Mapping[str, Any]], str]
 """Text of a table's cell, from the row."""
 
-COLUMNS: dict[str, tuple[str, Text]] = {
+REPORT_COLUMNS: dict[str, tuple[str, Text]] = {
     "case": ("case", lambda row: row["case"]),
     "rank": ("rank", lambda row: str(row["rank"])),
     "samples": ("plant samples", lambda row: str(row["plant_samples"] or "")),
@@ -37,30 +37,30 @@ COLUMNS: dict[str, tuple[str, Text]] = {
     ),
     "regret": (
         "regret %, median [95 %]",
-        lambda row: _percent(row, "regret_median", "regret_wide"),
+        lambda row: _percent_cell(row, "regret_median", "regret_wide"),
     ),
-    "worst": ("worst", lambda row: _percent(row, "regret_worst") if row["runs"] > 1 else ""),
-    "iqm": ("IQM [95 %]", lambda row: _percent(row, "regret_iqm") if row["runs"] > 1 else ""),
-    "J": ("J, median", lambda row: _number(row["J_median"])),
-    "J-worst": ("J, worst", lambda row: _number(row["J_worst"]) if row["runs"] > 1 else ""),
-    "gap": ("gap closed %", lambda row: _percent(row, "gap_closed_median", digits=4)),
-    "economic": ("economic cost", lambda row: _number(row["economic_cost"])),
+    "worst": ("worst", lambda row: _percent_cell(row, "regret_worst") if row["runs"] > 1 else ""),
+    "iqm": ("IQM [95 %]", lambda row: _percent_cell(row, "regret_iqm") if row["runs"] > 1 else ""),
+    "J": ("J, median", lambda row: _number_text(row["J_median"])),
+    "J-worst": ("J, worst", lambda row: _number_text(row["J_worst"]) if row["runs"] > 1 else ""),
+    "gap": ("gap closed %", lambda row: _percent_cell(row, "gap_closed_median", digits=4)),
+    "economic": ("economic cost", lambda row: _number_text(row["economic_cost"])),
     "violation": ("violation", lambda row: f"{row['mean_violation']:.5f}"),
     "violating": ("violating %", lambda row: f"{100 * row['violating_share']:.2f}"),
     "against": ("against", lambda row: row["against"] if isinstance(row["against"], str) else ""),
-    "difference": ("difference % [95 %]", lambda row: _percent(row, "difference")),
+    "difference": ("difference % [95 %]", lambda row: _percent_cell(row, "difference")),
     "p": ("p", lambda row: "" if np.isnan(row["difference_p"]) else f"{row['difference_p']:.3f}"),
 }
 """Columns of a scenario's table by the names that options take, of rows of the summary."""
-SHORT = ("case", "rank", "regret", "worst", "finished")
+SHORT_COLUMNS = ("case", "rank", "regret", "worst", "finished")
 """Columns that fit a terminal of 80 characters."""
 
 AGGREGATE_TEXTS: dict[str, Text] = {
     "case": lambda row: row["case"],
     "runs": lambda row: str(row["runs"]),
-    "regret %, IQM [95 %]": lambda row: _percent(row, "regret_iqm"),
-    "median": lambda row: _percent(row, "regret_median"),
-    "worst": lambda row: _percent(row, "regret_worst"),
+    "regret %, IQM [95 %]": lambda row: _percent_cell(row, "regret_iqm"),
+    "median": lambda row: _percent_cell(row, "regret_median"),
+    "worst": lambda row: _percent_cell(row, "regret_worst"),
 }
 CASES: dict[str, Text] = {
     "case": lambda row: row["name"],
@@ -76,8 +76,8 @@ EVERY_RUN: dict[str, Text] = {
     "seed": lambda row: "" if pd.isna(row["training_seed"]) else str(row["training_seed"]),
     "status": lambda row: row["status"],
     "plant samples": lambda row: str(row["plant_samples"] or ""),
-    "regret % [95 %]": lambda row: _percent(row, "regret"),
-    "J": lambda row: _number(row["J"]),
+    "regret % [95 %]": lambda row: _percent_cell(row, "regret"),
+    "J": lambda row: _number_text(row["J"]),
 }
 
 PAPER = {"naive": 21.0, "tuned": 15.0}
@@ -117,7 +117,7 @@ def texts(
     return list(columns), lines
 
 
-def _percent(row: Mapping[str, Any], name: str, ends: str = "", digits: int = 3) -> str:
+def _percent_cell(row: Mapping[str, Any], name: str, ends: str = "", digits: int = 3) -> str:
     """A share in per cent with its interval, if any; empty if undefined.
 
     Args:
@@ -134,7 +134,7 @@ def _percent(row: Mapping[str, Any], name: str, ends: str = "", digits: int = 3)
     return shown(float(row[name]), interval, 100.0, digits)
 
 
-def _number(value: float) -> str:
+def _number_text(value: float) -> str:
     return shown(float(value), digits=6)
 
 

@@ -28,7 +28,7 @@ from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
 from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Study, StudyPlan, plan
-from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
+from cosim.studies.report import NEAR, PAPER, REPORT_COLUMNS, SHORT_COLUMNS
 from cosim.studies.run import (
     GREEDY,
     INDICATORS,
@@ -36,8 +36,8 @@ from cosim.studies.run import (
     Runner,
     RunStore,
     folder_name,
+    frame_csv,
     read_table,
-    to_csv,
     typed,
 )
 
@@ -49,36 +49,37 @@ RUNS_TABLE = "runs.csv"
 SUMMARY = "summary.csv"
 AGGREGATE = "aggregate.csv"
 OPERATION = "operation.csv"
-TABLES = (RUNS_TABLE, EVALUATION, CURVES)
+RAW_TABLES = (RUNS_TABLE, EVALUATION, CURVES)
 """Tables of every study that are read again."""
-STUDY_FILES = (*TABLES, SUMMARY, AGGREGATE, OPERATION, GREEDY, TIMING, ABOUT, "summary.json")
+STUDY_FILES = (*RAW_TABLES, SUMMARY, AGGREGATE, OPERATION, GREEDY, TIMING, ABOUT, "summary.json")
 """Files beside those of the runs; all in a folder belong to one study."""
 WHERE = ["scenario", "case"]
 RUN_KEYS = [*WHERE, "training_seed"]
-STATE = [*RUN_KEYS, "status", "samples", "plant_samples"]
-MEASURED = {
-    RUNS_TABLE: STATE,
+RUN_STATE = [*RUN_KEYS, "status", "samples", "plant_samples"]
+MEASURED_COLUMNS = {
+    RUNS_TABLE: RUN_STATE,
     EVALUATION: [*RUN_KEYS, "seed", "steps", *INDICATORS],
     CURVES: [*RUN_KEYS, "samples", "J", "greedy_J", "td_error"],
     OPERATION: [*RUN_KEYS, "samples", *operation.OPERATION_METRICS],
     GREEDY: [*RUN_KEYS, "samples", "seed", "J"],
 }
-"""Columns of the tables that runs give; `TABLES` are those of every study."""
+"""Columns of the tables that runs give; `RAW_TABLES` are those of every study."""
 CASE_FIELDS = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
 """What study.json says of a case as it is."""
 MOST_LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
-MEANS = ["economic_cost", "mean_violation", "violating_share"]
+AGGREGATED_MEANS = ["economic_cost", "mean_violation", "violating_share"]
 RUN_COLUMNS = [
-    *STATE, "J", "regret", "regret_low", "regret_high", "gap_closed", *MEANS, "failures",
+    *RUN_STATE, "J", "regret", "regret_low", "regret_high", "gap_closed", *AGGREGATED_MEANS,
+    "failures",
 ]  # fmt: skip
 SUMMARY_COLUMNS = [
     *WHERE, "samples", "plant_samples", "finished", "runs", "regret_median",
     "regret_median_low", "regret_median_high", "regret_worst", "regret_iqm", "regret_iqm_low",
-    "regret_iqm_high", "J_median", "J_worst", "J_iqm", "gap_closed_median", *MEANS, "failures",
-    "regret_wide_low", "regret_wide_high", "rank", "against", "difference", "difference_low",
-    "difference_high", "difference_p",
+    "regret_iqm_high", "J_median", "J_worst", "J_iqm", "gap_closed_median", *AGGREGATED_MEANS,
+    "failures", "regret_wide_low", "regret_wide_high", "rank", "against", "difference",
+    "difference_low", "difference_high", "difference_p",
 ]  # fmt: skip
 AGGREGATE_COLUMNS = [
     "case", "scenarios", "runs", "regret_median", "regret_worst", "regret_iqm", "regret_iqm_low",
@@ -114,7 +115,7 @@ class StudyResults(Shown):
         about = read_json(path, f"'{path}'", StudyError)
         if about.get("schema") != SCHEMA:
             raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
-        tables = {name: read_table(folder / name, MEASURED[name]) for name in TABLES}
+        tables = {name: read_table(folder / name, MEASURED_COLUMNS[name]) for name in RAW_TABLES}
         return cls(folder, about, *tables.values())
 
     @classmethod
@@ -133,7 +134,7 @@ class StudyResults(Shown):
         tables = _measured(_in_the_studys_order(plan, stores))
         about = document(plan)
         about["pictures"] = figures.draw_kept(plan, out) if draw else []
-        results = cls(out, about, *(tables[name] for name in TABLES))
+        results = cls(out, about, *(tables[name] for name in RAW_TABLES))
         if not about.get("operation"):
             del tables[OPERATION], tables[GREEDY]
         tables[RUNS_TABLE] = results.runs
@@ -143,7 +144,7 @@ class StudyResults(Shown):
             tables[AGGREGATE] = results.aggregate
         with staged(out, STUDY_FILES) as stage:
             for name, table in tables.items():
-                (stage / name).write_text(to_csv(table), "utf-8")
+                (stage / name).write_text(frame_csv(table), "utf-8")
             text = json.dumps(about, indent=1, sort_keys=True) + "\n"
             (stage / ABOUT).write_text(text, "utf-8")
         return results
@@ -242,7 +243,7 @@ class StudyResults(Shown):
             indicators = self._indicators[scenario, case]
             for run, row in enumerate(states.to_dict("records")):
                 row.update(_columns("regret", self.regret(case, scenario, [run])))
-                for name in ("J", *MEANS):
+                for name in ("J", *AGGREGATED_MEANS):
                     row[name] = float(indicators[name][run].mean())
                 # The mean cost of a run that diverged may be NaN.
                 if not np.isfinite(row["J"]):
@@ -294,7 +295,7 @@ class StudyResults(Shown):
         }
         row.update(_columns("regret_median", self.regret(case, scenario, middle)))
         row.update(_columns("regret_iqm", iqm))
-        for name in MEANS:
+        for name in AGGREGATED_MEANS:
             row[name] = float(np.median(runs[name]))
         row.update(self._comparisons(case, scenario))
         return row
@@ -398,20 +399,20 @@ class StudyResults(Shown):
 
         Args:
             scenario: its name.
-            columns: keys of `COLUMNS`; by default all, the last three only where a case has a
-                counterpart.
+            columns: keys of `REPORT_COLUMNS`; by default all, the last three only where a case
+                has a counterpart.
 
         Raises:
             StudyError: there is no such column.
         """
         if columns is None:
             paired = any(case.get("against") for case in self.cases.values())
-            columns = list(COLUMNS) if paired else list(COLUMNS)[:-3]
+            columns = list(REPORT_COLUMNS) if paired else list(REPORT_COLUMNS)[:-3]
         for name in columns:
-            if name not in COLUMNS:
-                raise StudyError(f"a table has no column '{name}'{instead(name, COLUMNS)}")
+            if name not in REPORT_COLUMNS:
+                raise StudyError(f"a table has no column '{name}'{instead(name, REPORT_COLUMNS)}")
         rows = self.summary[self.summary.scenario == scenario].to_dict("records")
-        return report.texts(rows, dict(COLUMNS[name] for name in columns))
+        return report.texts(rows, dict(REPORT_COLUMNS[name] for name in columns))
 
     def table(self, scenario: str | None = None) -> str:
         """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
@@ -431,7 +432,7 @@ class StudyResults(Shown):
     def _repr_html_(self) -> str:
         parts = []
         for name in self.scenarios:
-            header, rows = self.lines(name, SHORT)
+            header, rows = self.lines(name, SHORT_COLUMNS)
             table = pd.DataFrame(rows, columns=list(header)).to_html(index=False)
             parts.append(f"<h4>{escape(name)}</h4>{table}")
         return "".join(parts)
@@ -576,8 +577,10 @@ class StudyResults(Shown):
     def _operation_result(self, scenario: str) -> operation.OperationResult:
         """Regrets of the runs in operation on a scenario."""
         runs = read_table(self.folder / OPERATION, needed=["samples"])
-        runs = runs.reindex(columns=MEASURED[OPERATION])  # an older table lacks the latest ones
-        greedy = read_table(self.folder / GREEDY, MEASURED[GREEDY])
+        runs = runs.reindex(
+            columns=MEASURED_COLUMNS[OPERATION]
+        )  # an older table lacks the latest ones
+        greedy = read_table(self.folder / GREEDY, MEASURED_COLUMNS[GREEDY])
         return operation.operation_result(
             runs[runs.scenario == scenario],
             greedy[greedy.scenario == scenario],
@@ -726,11 +729,11 @@ def _keep_files(plan: StudyPlan, out: Path) -> None:
 
 
 def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
-    """The tables `MEASURED` of finished runs.
+    """The tables `MEASURED_COLUMNS` of finished runs.
 
     In operation the optimum has a run on the noise of every training seed, of which J is known.
     """
-    parts: dict[str, list[pd.DataFrame]] = {name: [] for name in MEASURED}
+    parts: dict[str, list[pd.DataFrame]] = {name: [] for name in MEASURED_COLUMNS}
     for store in stores:
         run = store.run
         key = {"scenario": run.scenario.name, "case": run.case, "training_seed": run.seed}
@@ -764,7 +767,7 @@ def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
         if online:
             parts[OPERATION].append(pd.concat(online).sort_values(["training_seed", "samples"]))
     tables = {}
-    for name, columns in MEASURED.items():
+    for name, columns in MEASURED_COLUMNS.items():
         rows = pd.concat(parts[name] or [pd.DataFrame()], ignore_index=True)
         tables[name] = typed(rows.reindex(columns=columns))
     return tables

@@ -94,7 +94,7 @@ def typed(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.astype({name: TYPES.get(name, float) for name in frame})
 
 
-def to_csv(frame: pd.DataFrame) -> str:
+def frame_csv(frame: pd.DataFrame) -> str:
     """A frame as CSV; floats read back to the same bits, NaN is empty."""
     return str(frame.to_csv(index=False, lineterminator="\n"))
 
@@ -565,7 +565,7 @@ class RunStore:
             rows.insert(0, "seed", rows.index)
             rows.insert(1, "steps", noise.steps)
             rows.insert(2, "burn_in", noise.burn_in)
-            write_atomically(self.folder / file, to_csv(rows))
+            write_atomically(self.folder / file, frame_csv(rows))
         self._quiet_until = time.monotonic() + PAUSE * (time.monotonic() - clock)
 
     def seal(self) -> None:

@@ -33,14 +33,14 @@ from cosim.studies.results import (
     WHERE,
     StudyResults,
 )
-from cosim.studies.run import GREEDY, RUNS_FOLDER, to_csv
+from cosim.studies.run import GREEDY, RUNS_FOLDER, frame_csv
 
 TOLERANCES = "tolerances.toml"
 DIGITS = 8
 """Significant digits of stored numbers."""
 WORK = ".work"
 """Folder within the folder, of the runs of studies."""
-WORDS = ("status", "against", "hash")
+WORD_COLUMNS = ("status", "against", "hash")
 """Columns that hold words, which must be the same; every other one holds numbers."""
 KEY_COLUMNS = {
     EVALUATION: [*RUN_KEYS, "seed"],
@@ -57,7 +57,7 @@ KEY_COLUMNS = {
 """Key columns of a study's tables, by their file or by the folder that they are in."""
 LARGEST = 4_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
-SUFFIXES = (".csv", ".toml", ".md")
+STORED_SUFFIXES = (".csv", ".toml", ".md")
 """Of the files that are stored: figures are drawn from them."""
 
 
@@ -96,7 +96,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     left_out = []
     for path in sorted(out.rglob("*")):
         relative = path.relative_to(out)
-        kept = path.suffix in SUFFIXES or path.name == ABOUT
+        kept = path.suffix in STORED_SUFFIXES or path.name == ABOUT
         if (
             not path.is_file()
             or relative.parts[0] == RUNS_FOLDER
@@ -106,7 +106,9 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
             continue
         content = path.read_bytes()
         if path.suffix == ".csv":  # a last bit is no change
-            content = to_csv(pd.read_csv(path, dtype=str, na_filter=False).map(_rounded)).encode()
+            content = frame_csv(
+                pd.read_csv(path, dtype=str, na_filter=False).map(_rounded_cell)
+            ).encode()
         if len(content) > LARGEST:
             left_out.append(relative.as_posix())
             continue
@@ -196,7 +198,7 @@ def compared_tables(folder: Path) -> dict[str, list[str]]:
     return tables
 
 
-def differences(
+def table_differences(
     name: str, stored: Path, now: Path, tolerances: Mapping[str, Tolerance]
 ) -> list[str]:
     """Differences of a stored study from the same computed now, in words.
@@ -237,7 +239,8 @@ def differences(
 def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
     """A stored table by its key columns.
 
-    The columns named in `WORDS` hold texts, all others floats. `attrs` has the columns' units.
+    The columns named in `WORD_COLUMNS` hold texts, all others floats. `attrs` has the columns'
+    units.
     """
     try:
         if path.suffix == ".toml":
@@ -256,8 +259,8 @@ def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
     try:
         for title in frame:
             name = names[title]
-            cells = [_rounded(cell) for cell in frame[title]]
-            if name in keys or name in WORDS:
+            cells = [_rounded_cell(cell) for cell in frame[title]]
+            if name in keys or name in WORD_COLUMNS:
                 columns[name] = cells
             else:
                 columns[name] = [float(cell or "nan") for cell in cells]
@@ -308,7 +311,7 @@ def _table_differences(
     first: list[tuple[int, str]] = []
     for signal in stored.columns.intersection(now.columns, sort=False):
         before, after = stored_rows[signal].to_numpy(), rows_now[signal].to_numpy()
-        if signal in WORDS:
+        if signal in WORD_COLUMNS:
             differs = before != after
             bound = ""
         else:
@@ -345,7 +348,7 @@ def _row(table: pd.DataFrame, row: object) -> str:
     return ", ".join(f"{key}={value}" for key, value in pairs if value)
 
 
-def _rounded(cell: str) -> str:
+def _rounded_cell(cell: str) -> str:
     """A cell as tables store it: numbers with eight digits, whole ones and words as they are."""
     try:
         int(cell)

@@ -8,7 +8,7 @@ import scipy.stats
 from controllers import OptimalPolicy, Quantity, evaporator, factories
 from controllers.dynamic_programming import BellmanOperator, Settings, objection
 from controllers.errors import OptimumError
-from controllers.optimum import SHIPPED, optimum_key, read_optimum
+from controllers.optimum import SHIPPED_OPTIMA, optimum_key, read_optimum
 from controllers.problem import PlantProblem, Problem
 from cosim import FmuPlant, Scenario, simulate
 
@@ -38,7 +38,7 @@ def policy(policies):
 def test_presets_policies_are_shipped(name):
     plant = PlantProblem.from_scenario(Scenario.load(name))
     key = optimum_key(plant, Settings())
-    path = SHIPPED / f"{key}.npz"
+    path = SHIPPED_OPTIMA / f"{key}.npz"
     assert path.is_file(), "equations or solver changed: solve anew with `cosim optimum`"
     assert path.stat().st_size < 300_000
     certificate = read_optimum(path, key).certificate
@@ -49,7 +49,7 @@ def test_presets_policies_are_shipped(name):
 @pytest.mark.parametrize("name", GAINS)
 def test_the_optimum_that_is_shipped_is_the_known_one(name):
     key = optimum_key(PlantProblem.from_scenario(Scenario.load(name)), Settings())
-    assert read_optimum(SHIPPED / f"{key}.npz", key).gain == GAINS[name]
+    assert read_optimum(SHIPPED_OPTIMA / f"{key}.npz", key).gain == GAINS[name]
 
 
 @pytest.mark.parametrize("name", PRESETS)

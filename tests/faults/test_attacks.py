@@ -102,12 +102,12 @@ def test_the_state_that_a_controller_reads_cannot_be_written(plant):
 @pytest.mark.parametrize("name", ["s", "a", "next_s"])
 def test_what_a_rule_observes_cannot_be_written(name):
     from learning.algorithm import load_algorithm
-    from learning.training_run import begin
+    from learning.training_run import begin_training
     from tests.helpers.training import make_run
 
     run = make_run(samples=20)
     with FmuPlant(PAPER) as plant:
-        loop = begin(run, load_algorithm(run.algorithm), plant)
+        loop = begin_training(run, load_algorithm(run.algorithm), plant)
         transition, _ = loop.next()
     with pytest.raises(ValueError, match="read-only"):
         getattr(transition, name)[0] = 0.0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from controllers.export import Core
-from controllers.export.core import QP_SOURCES, SOURCES
+from controllers.export.core import ENGINE_SOURCES, QP_SOURCES
 from controllers.qp import QpSolution, SoftQp
 
 FLAGS = ("-std=c99", "-O0", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
@@ -67,7 +67,7 @@ class CompiledQpSolver:
     """The C solver for QPs of one size."""
 
     def __init__(self, folder: Path, variables: int, rows: int) -> None:
-        sources = {name: (SOURCES / name).read_bytes() for name in QP_SOURCES}
+        sources = {name: (ENGINE_SOURCES / name).read_bytes() for name in QP_SOURCES}
         sources["solve.c"] = QP.encode()
         self._library = library(folder, sources, f"-DQP_N={variables}", f"-DQP_ROWS={rows}")
         self._sizes = variables, variables, rows

@@ -8,7 +8,7 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import BatchQLearning, QLearning
 from learning.batch_q_learning import ReplayBuffer
-from learning.training_run import TrainingRun, begin, starting_parameters
+from learning.training_run import TrainingRun, begin_training, starting_parameters
 from tests.helpers.training import looped
 
 
@@ -20,7 +20,7 @@ def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenar
         configuration = algorithm.Configuration.from_dict(settings | {"measure_offset": measured})
         run = TrainingRun("batch-q-learning", scenario, 120, 3, configuration, start="tuned")
         with FmuPlant(scenario) as plant:
-            learner = begin(run, algorithm, plant)
+            learner = begin_training(run, algorithm, plant)
             updates = [learner.advance()[1] is not None for _ in range(120)]
         assert np.flatnonzero(updates).tolist() == [59, 79, 99, 119]
         offsets[measured] = learner.controller.parameters["c_f"]

@@ -10,7 +10,7 @@ from cosim import FmuPlant, Scenario
 from learning.identified import Identified
 from learning.log import to_csv
 from learning.training import run_training
-from learning.training_run import begin
+from learning.training_run import begin_training
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed
 
@@ -34,7 +34,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
 def test_it_goes_on_and_backs_off_by_its_own_errors():
     run = make_run("fouled", samples=1000)
     with FmuPlant(run.scenario) as plant:
-        loop, moved, bounds = begin(run, Identified, plant), [], []
+        loop, moved, bounds = begin_training(run, Identified, plant), [], []
         for sample in range(1000):
             if loop.advance()[1] is not None:
                 moved.append(sample)

@@ -16,7 +16,7 @@ from learning.errors import PrivilegeError
 from learning.exploration import Strategy
 from learning.loop import PlantInOperation, TrainingLoop
 from learning.training import run_training
-from learning.training_run import HELD_OUT, TrainingRun, begin, starting_parameters
+from learning.training_run import HELD_OUT, TrainingRun, begin_training, starting_parameters
 
 
 class Idle:
@@ -104,7 +104,7 @@ def make_run(scenario, seed=3):
 
 
 def test_an_update_is_reported_where_theta_moves(plant):
-    loop = begin(make_run(plant.scenario), QLearning, plant)
+    loop = begin_training(make_run(plant.scenario), QLearning, plant)
     for number in range(40):
         before = loop.controller.theta.copy()
         _, update = loop.advance()
@@ -115,7 +115,7 @@ def test_an_update_is_reported_where_theta_moves(plant):
 
 def test_a_rule_that_rests_neither_moves_nor_explores(plant):
     run = dataclasses.replace(make_run(plant.scenario), rest_after=40)
-    loop = begin(run, QLearning, plant)
+    loop = begin_training(run, QLearning, plant)
     updates = [loop.advance()[1] for _ in range(40)]
     assert updates[-1] is not None
     theta, explored = loop.controller.theta.copy(), loop.counts.explored
@@ -142,7 +142,7 @@ class Privileged(Asking):
 
 
 def asking(plant, base, **says):
-    return begin(make_run(plant.scenario), type("Own", (base,), {"says": says}), plant)
+    return begin_training(make_run(plant.scenario), type("Own", (base,), {"says": says}), plant)
 
 
 def test_a_plant_in_operation_is_never_reset(plant):
@@ -158,8 +158,12 @@ def test_a_plant_in_operation_is_never_reset(plant):
 
 def test_a_first_episode_is_a_simulators_too(plant):
     with pytest.raises(PrivilegeError):
-        begin(make_run(plant.scenario), type("Own", (Asking,), {"first_episode": 3}), plant)
-    begin(make_run(plant.scenario), type("Own", (Privileged,), {"first_episode": 3}), plant)
+        begin_training(
+            make_run(plant.scenario), type("Own", (Asking,), {"first_episode": 3}), plant
+        )
+    begin_training(
+        make_run(plant.scenario), type("Own", (Privileged,), {"first_episode": 3}), plant
+    )
     first = plant.reset(3), plant.step(plant.scenario.reference_action).s
     assert np.array_equal(first[0], plant.scenario.initial_state)
 

@@ -12,7 +12,7 @@ from learning.log import to_csv
 from learning.offset_free import OffsetFree
 from learning.prediction_errors import OneStepModel
 from learning.training import run_training
-from learning.training_run import begin
+from learning.training_run import begin_training
 from tests.helpers import training
 from tests.helpers.training import Carrier, killed_and_resumed
 
@@ -50,7 +50,7 @@ def test_it_predicts_without_bias_under_a_wrong_model():
 def test_it_goes_on_and_backs_off_by_its_own_errors():
     run = make_run("fouled", samples=1400)
     with FmuPlant(run.scenario) as plant:
-        loop, moved, bounds = begin(run, OffsetFree, plant), [], []
+        loop, moved, bounds = begin_training(run, OffsetFree, plant), [], []
         for sample in range(1400):
             if loop.advance()[1] is not None:
                 moved.append(sample)

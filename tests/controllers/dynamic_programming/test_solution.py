@@ -5,7 +5,7 @@ import pytest
 from scipy import sparse
 
 from controllers.dynamic_programming import (
-    Estimate,
+    GainEstimate,
     Grid,
     Settings,
     certify,
@@ -122,9 +122,11 @@ def test_a_solution_is_certified_by_its_refinements(optimum):
 
 def against(search=None, **values):
     given = {"solution": 1000.0, "refinement": 1000.2, "simulation": 999.9} | values
-    figures = [Estimate(name, x, x - 0.1, x + 0.1) for name, x in given.items() if x is not None]
+    figures = [
+        GainEstimate(name, x, x - 0.1, x + 0.1) for name, x in given.items() if x is not None
+    ]
     if search is not None:
-        figures.append(Estimate("policy search", search, search - 0.1, search + 0.1))
+        figures.append(GainEstimate("policy search", search, search - 0.1, search + 0.1))
     return objection(figures)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controllers import optimum as store
-from controllers.dynamic_programming import Estimate, Settings, solve
+from controllers.dynamic_programming import GainEstimate, Settings, solve
 from controllers.errors import OptimumError
 from controllers.problem import DisturbanceLaw, PlantProblem, Problem
 from cosim import Scenario
@@ -19,7 +19,7 @@ P = PROBLEM.model.nominal_parameters
 
 @pytest.fixture(scope="module")
 def optimum():
-    certificate = (Estimate("solution", 1.0, 0.9, 1.1),)
+    certificate = (GainEstimate("solution", 1.0, 0.9, 1.1),)
     return replace(solve(SCALAR.plant, Settings(level=0)), certificate=certificate)
 
 

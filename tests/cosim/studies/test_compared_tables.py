@@ -9,11 +9,11 @@ import pytest
 
 from cosim.core.errors import ResultsError
 from cosim.studies.stored import (
-    WORDS,
+    WORD_COLUMNS,
     compared_tables,
-    differences,
     load_tolerances,
     stored_studies,
+    table_differences,
 )
 
 STORED = Path(__file__).parents[3] / "results"
@@ -43,7 +43,7 @@ def twice(tmp_path):
 
 
 def compared(study, stored, now):
-    return differences(study, stored, now, load_tolerances(STORED))
+    return table_differences(study, stored, now, load_tolerances(STORED))
 
 
 def read(path):
@@ -59,7 +59,7 @@ def write(path, header, rows):
 
 def other(cell, name):
     """Another content of a cell."""
-    if name in WORDS:
+    if name in WORD_COLUMNS:
         return cell + "x"
     return str(float(cell or 0.0) * 1.01 + 1.0)
 

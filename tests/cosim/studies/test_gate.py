@@ -35,7 +35,7 @@ def model(patch):
     """The heat transfer in the controller's model; the plants of the gate have their own."""
     changed = [
         dataclasses.replace(q, nominal=1.01 * q.nominal) if q.name == "UA2" else q
-        for q in evaporator.PARAMETERS
+        for q in evaporator.PARAMETER_VALUES
     ]
     patch.setattr(evaporator, "PARAMETERS", tuple(changed))
 

@@ -10,7 +10,7 @@ import pytest
 
 from cosim.core.errors import StudyError
 from cosim.studies.results import RUN_KEYS, StudyResults
-from cosim.studies.run import to_csv
+from cosim.studies.run import frame_csv
 from tests.helpers.toy_study import GROW, run_toy
 
 ROOT = Path(__file__).parents[3]
@@ -74,7 +74,7 @@ def test_tables_are_read_and_written_to_the_same_bytes(results):
     again = StudyResults.load(results.folder)
     for name in ("runs", "evaluation", "curves", "summary"):
         written = (results.folder / f"{name}.csv").read_text()
-        assert to_csv(getattr(again, name)) == written, name
+        assert frame_csv(getattr(again, name)) == written, name
 
 
 def test_an_own_reader_finds_the_stored_summary():

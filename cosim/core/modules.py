@@ -110,7 +110,7 @@ def load_plugin(
                 _forget_edited_modules()
             plugin: Any = importlib.import_module(module)
             place = _place(module) if foreign else None
-            if place is not None:
+            if place is not None and not _is_pythons(place):
                 _hash_when_loaded(place)
         for part in attribute.split("."):
             plugin = getattr(plugin, part)
@@ -152,12 +152,11 @@ def code_of(module: str) -> str | None:
     place = _place(module)
     if place is None:
         return UNKNOWN
-    installed = bool(INSTALLED & set(place.parts))
-    if not installed and any(place.is_relative_to(folder) for folder in PYTHON):
+    if _is_pythons(place):
         return None
     code = _hash_when_loaded(place)
     words = []
-    if installed:
+    if _is_installed(place):
         for name in _distributions().get(top, []):
             words.append(f"{name} {version(name)}")
     return " ".join([*words, code])
@@ -187,6 +186,16 @@ def _place(module: str) -> Path | None:
     return path.parents[depth - 1] if depth else path
 
 
+def _is_installed(place: Path) -> bool:
+    return bool(INSTALLED & set(place.parts))
+
+
+def _is_pythons(place: Path) -> bool:
+    """Whether a place is a folder of Python's own modules."""
+    in_python = any(place.is_relative_to(folder) for folder in PYTHON)
+    return in_python and not _is_installed(place)
+
+
 def _hash_when_loaded(place: Path) -> str:
     """Hash of the sources at a place, as of the time when its modules were first loaded."""
     # Reading them takes some 50 ms of a folder with 500 modules: not again for each question.
@@ -197,15 +206,20 @@ def _hash_when_loaded(place: Path) -> str:
 
 def _forget_edited_modules() -> None:
     """Remove the modules of places whose sources have changed since, so that they load anew."""
-    for place, code in list(_loaded.items()):
+    for place, code in _users_places():
         if _sources_hash(place) != code:
             _forget(place)
 
 
 def forget_users_modules() -> None:
     """Remove all modules of users, so that they load anew and read their data files again."""
-    for place in list(_loaded):
+    for place, _ in _users_places():
         _forget(place)
+
+
+def _users_places() -> list[tuple[Path, str]]:
+    """Places that a user edits, with their hashes; what is installed stays as it was loaded."""
+    return [(place, code) for place, code in _loaded.items() if not _is_installed(place)]
 
 
 def _forget(place: Path) -> None:

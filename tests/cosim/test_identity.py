@@ -259,3 +259,21 @@ def test_our_own_code_is_known_by_its_c_too_and_not_by_stored_results(monkeypatc
             "cosim/results/d.toml"
         }
     code_hash.cache_clear()
+
+
+def test_an_object_of_pythons_own_is_loaded_and_never_loaded_anew(monkeypatch, tmp_path, paper):
+    """Loaded anew, modules that hold the process's state would be there twice."""
+    import json  # noqa: PLC0415
+    import multiprocessing.context  # noqa: PLC0415
+    import warnings  # noqa: PLC0415
+
+    monkeypatch.chdir(tmp_path)
+    before = [json, multiprocessing.context, warnings, sys.modules["numpy"]]
+    assert load_plugin("json:loads", "it", ControllerLookupError) is json.loads
+    load_plugin("numpy:zeros", "it", ControllerLookupError)
+    data = tmp_path / "data.csv"
+    for content in ("1", "2"):
+        data.write_text(content)
+        depends_on(paper, [], files={"data": data})
+    names = ("json", "multiprocessing.context", "warnings", "numpy")
+    assert [sys.modules[name] for name in names] == before

@@ -28,9 +28,9 @@ def own_cache(monkeypatch, tmp_path):
 def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):
     folder = tmp_path / "optima"
     folder.mkdir(mode=0o700)
-    for shipped in store.SHIPPED.glob("*.npz"):
+    for shipped in store.SHIPPED_OPTIMA.glob("*.npz"):
         (folder / shipped.name).write_bytes(b"damaged")
-    monkeypatch.setattr(store, "SHIPPED", tmp_path / "none")
+    monkeypatch.setattr(store, "SHIPPED_OPTIMA", tmp_path / "none")
     code, out, err = cosim("optimum", "--scenario", "paper")
     assert (code, out) == (2, "")
     assert "not a readable optimal policy" in err

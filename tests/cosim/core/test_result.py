@@ -65,7 +65,7 @@ def test_frames_hold_the_values(run, training):
     frame = run.to_pandas()
     np.testing.assert_array_equal(frame["X2"], run["X2"])
     assert list(frame["status"]) == list(run.status)
-    np.testing.assert_array_equal(training.to_pandas()["samples"], [20, 40])
+    np.testing.assert_array_equal(training.to_pandas()["samples"], [0, 20, 40])
     np.testing.assert_array_equal(
         training.parameters.to_pandas()["theta"], training.parameters.theta
     )

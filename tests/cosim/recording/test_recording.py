@@ -115,7 +115,7 @@ def test_a_training_comes_back_as_its_log_and_the_change_of_each_block(tmp_path,
         assert np.array_equal(recording.signals[f"increment/{name}"], one)
     for name, values in training.log().items():
         assert np.array_equal(recording.signals[name], values, equal_nan=True)
-    assert recording.samples.tolist() == [20, 40, 60]
+    assert recording.samples.tolist() == [0, 20, 40, 60]
     assert recording.properties["seed"] == "9"
     assert worst_moment(path) == 60
 

@@ -135,7 +135,7 @@ def test_one_per_cent_in_plant_or_cost_fails_and_names_the_signal(changed, chang
 
 
 def test_a_loose_qp_tolerance_fails_and_names_the_signal(changed, monkeypatch):
-    monkeypatch.setattr("controllers.qp.SETTINGS", {"primal_tol": 1e-2})
+    monkeypatch.setattr("controllers.qp.DAQP_SETTINGS", {"primal_tol": 1e-2})
     code, output = check(changed(""))
     assert code == 1
     assert "signal X2" in output

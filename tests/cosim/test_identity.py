@@ -263,9 +263,9 @@ def test_our_own_code_is_known_by_its_c_too_and_not_by_stored_results(monkeypatc
 
 def test_an_object_of_pythons_own_is_loaded_and_never_loaded_anew(monkeypatch, tmp_path, paper):
     """Loaded anew, modules that hold the process's state would be there twice."""
-    import json  # noqa: PLC0415
-    import multiprocessing.context  # noqa: PLC0415
-    import warnings  # noqa: PLC0415
+    import json
+    import multiprocessing.context
+    import warnings
 
     monkeypatch.chdir(tmp_path)
     before = [json, multiprocessing.context, warnings, sys.modules["numpy"]]

@@ -97,6 +97,7 @@ def test_a_stored_build_is_taken_where_there_is_a_compiler_too(folder, monkeypat
     assert answer(8) is None
 
 
+@pytest.mark.slow
 def test_a_compiler_that_fails_or_hangs_leaves_nothing(folder, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", FAILS)
     assert answer(42) is None
@@ -138,6 +139,7 @@ def test_never_means_never_and_an_unknown_word_in_the_switch_is_refused(folder, 
         answer(42)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_long_run_is_compiled_and_a_shorter_one_is_not(folder):
     problem = evaporator_problem(horizon=2)

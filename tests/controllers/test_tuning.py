@@ -90,6 +90,7 @@ def test_the_published_procedure_gives_the_published_hessian():
     assert np.diag(found) == pytest.approx([1.5310e-2, 1.0848e-2, 9.2506e-5, 4.5407e-3], rel=5e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "fast-sampling"])
 def test_the_tunings_model_is_integrated_to_a_hundred_millionth(name):
     problem = PROBLEMS[name]

@@ -151,6 +151,7 @@ with zipfile.ZipFile(sys.argv[1]) as archive:
 """
 
 
+@pytest.mark.slow
 def test_processes_that_unpack_at_once_agree(cache, archive):
     command = [sys.executable, "-c", RACE, str(fmus.path())]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

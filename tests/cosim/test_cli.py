@@ -26,6 +26,7 @@ def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_pat
         assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_json_is_all_that_goes_to_standard_output_and_equals_the_file(cosim, tmp_path):
     code, out, _ = cosim("simulate", "--steps", 30, "--seed", 4, "--out", "a", "--json")
     assert code == 0
@@ -46,6 +47,7 @@ def test_the_same_command_and_seed_write_the_same_bytes(cosim, tmp_path):
     assert one == two
 
 
+@pytest.mark.slow
 def test_a_foreign_fmu_is_announced_with_its_hash(cosim, tmp_path):
     import hashlib
 

@@ -75,6 +75,7 @@ def test_a_failed_call_reports_what_the_fmu_logged(tanks, tmp_path, fault, words
                 plant.reset(0)
 
 
+@pytest.mark.slow
 def test_a_chatty_fmu_does_not_spoil_json(tanks, tmp_path):
     scenario = write_scenario(tmp_path, tanks[True], fault=4)
     words = ["simulate", "--scenario", scenario, "--out", tmp_path / "out", "--json"]

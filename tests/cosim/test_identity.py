@@ -126,6 +126,7 @@ def test_two_files_of_one_name_are_refused(plug, tmp_path):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_module_without_a_file_cannot_be_known(plug, paper, monkeypatch):
     module = type(sys)("typed_in_a_session")
     exec(PLUG, vars(module))
@@ -152,6 +153,7 @@ def run_study(case, out, lines, **changes):
     return found.evaluation[found.evaluation.case == "x"].J.tolist()
 
 
+@pytest.mark.slow
 def test_theta_that_is_replaced_during_a_study_is_the_one_that_was_planned(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = Parameters.naive(Problem.from_scenario(Scenario.load("paper")))
@@ -171,6 +173,7 @@ def test_theta_that_is_replaced_during_a_study_is_the_one_that_was_planned(tmp_p
     assert disturbed == undisturbed != with_second
 
 
+@pytest.mark.slow
 def test_a_data_file_that_a_study_names_counts(plug, tmp_path):
     name, path, _ = plug
     path.write_text(READER.format(path=str(tmp_path / "gain.txt")))
@@ -199,6 +202,7 @@ def test_an_edit_during_a_study_is_refused_by_name(plug):
 # Places -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_model_beside_its_scenario_is_found_by_workers_from_any_folder(tmp_path, monkeypatch):
     (tmp_path / "sub").mkdir()
     (tmp_path / "elsewhere").mkdir()
@@ -212,6 +216,7 @@ def test_a_model_beside_its_scenario_is_found_by_workers_from_any_folder(tmp_pat
     assert tables[0] == tables[1]
 
 
+@pytest.mark.slow
 def test_a_relative_fmu_is_the_same_for_workers(tmp_path, monkeypatch, paper):
     shutil.copy(ROOT / "fmus" / "evaporator.fmu", tmp_path / "mine.fmu")
     monkeypatch.chdir(tmp_path)

@@ -176,6 +176,7 @@ def numeric_options():
                 yield [*words, *needed, parameter.opts[0], bad]
 
 
+@pytest.mark.slow
 def test_a_bad_number_is_refused_by_every_option(cosim, tmp_path):
     for words in numeric_options():
         code, out, err = cosim(*words)

@@ -58,6 +58,7 @@ def test_clean_build_elsewhere_equals_the_shipped_files(tmp_path: Path) -> None:
         assert evaporator.differences(built / f"{name}.fmu", fmus.path(name)) == []
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_two_local_builds_are_byte_identical(tmp_path: Path) -> None:
     """And differ from the shipped files in nothing but binaries and the record of the build.

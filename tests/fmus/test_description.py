@@ -234,6 +234,7 @@ def test_a_plant_of_ones_own(version):
     assert {"compiler", "compilerOptions"} <= {*options}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_built")
 def test_an_exported_controller_and_its_loop(tmp_path):
     scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})

@@ -41,7 +41,7 @@ SMALLER = {
     "--seeds 20 --steps 1000": "--seeds 2 --steps 100",
     "--samples 40000": "--samples 5000",
 }
-SLOW = {"README.md"}
+SLOW = {"scenario.md", "fmpy.md", "README.md"}
 CHECKER = doctest.OutputChecker()
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 

@@ -54,12 +54,14 @@ def settle(plant, controller, start, steps=700):
     np.testing.assert_allclose(solution.action, problem.reference_action, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_from_any_feasible_start_it_settles_at_the_economic_steady_state(nominal):
     controller = naive(nominal.scenario)
     for start in STARTS:
         settle(nominal, controller, start)
 
 
+@pytest.mark.slow
 def test_with_the_exact_hessian_it_settles_too(nominal):
     problem = Problem.from_scenario(nominal.scenario)
     controller = RtiNmpc(problem, Parameters.naive(problem), hessian="exact")

@@ -154,6 +154,7 @@ def short_run(scenario="paper", **changes):
     return make_run("backoff", scenario, **{**values, **every, **changes})
 
 
+@pytest.mark.slow
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
     run = short_run()
     whole = run_training(run)
@@ -162,6 +163,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
     assert (whole.plant_samples, whole.status) == (450, "finished")
 
 
+@pytest.mark.slow
 def test_the_last_digits_of_the_start_choose_nothing(problem, tmp_path):
     """As those of the tuned θ, which a conic solver gives to 1e-10."""
     J, tuned, rng = [], tune(problem).parameters, np.random.default_rng(0)

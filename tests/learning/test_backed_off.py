@@ -22,6 +22,7 @@ def short(tuned, scenario, **settings):
     return back_off(tuned, scenario, samples=1000, **settings)
 
 
+@pytest.mark.slow
 def test_the_first_days_theta_is_tuned_and_backed_off_where_the_model_is_active(scenario, tuned):
     theta = build_controller("backed-off", scenario).parameters
     assert 26.0 < theta["x_l"][0] < 30.0

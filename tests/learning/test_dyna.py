@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from controllers.problem import Problem
 from learning.dyna import ModelPlant
@@ -33,6 +34,7 @@ def test_the_model_plays_the_plant_that_it_was_fitted_to(scenario, rng):
     assert len(np.unique(distances.argmin(axis=1))) > 200
 
 
+@pytest.mark.slow
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path):
     settings = {"interval": 20, "prior_samples": 30, "step_every": 10, "exploration_samples": 25}
     every = {"samples": 60, "log_every": 20, "evaluate_every": 60, "checkpoint_every": 20}

@@ -31,6 +31,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
     assert (whole.plant_samples, whole.status) == (450, "finished")
 
 
+@pytest.mark.slow
 def test_it_goes_on_and_backs_off_by_its_own_errors():
     run = make_run("fouled", samples=1000)
     with FmuPlant(run.scenario) as plant:
@@ -44,6 +45,7 @@ def test_it_goes_on_and_backs_off_by_its_own_errors():
     assert (lower > 25.5).all() and (upper <= 80.0).all()
 
 
+@pytest.mark.slow
 def test_it_finds_the_fouled_condenser_and_tunes_with_it():
     run = make_run("fouled", samples=1200)
     theta = run_training(run).parameters
@@ -62,6 +64,7 @@ def test_it_finds_the_fouled_condenser_and_tunes_with_it():
         assert theta[name] == pytest.approx(expected[name], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_again_and_again_it_follows_a_parameter():
     document = {"plant": {"parameters": {"fouling_rate": 30.0, "cleaning_period": 60.0}}}
     scenario = Scenario.load("drifting").replace(document)

@@ -83,6 +83,7 @@ def test_q_learning_finds_the_riccati_solution(linear_quadratic, rule, settings)
     assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rule", "settings"), RULES)
 def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, rule, settings):
     exact = linear_quadratic.riccati(1.0)[1]
@@ -91,6 +92,7 @@ def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, r
     assert gain(controller) == pytest.approx(exact, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_mean_cost_is_fitted_beside_theta(linear_quadratic):
     noise = 0.1
     exact = noise**2 * np.trace(linear_quadratic.riccati(1.0)[0])
@@ -128,6 +130,7 @@ def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
 ACTOR = {"forgetting": 0.0, "step_size": 0.2, "exploration_deviation": (1.0,), "radius": 0.3}
 
 
+@pytest.mark.slow
 def test_actor_critic_nears_the_riccati_gain_of_the_mean_cost(linear_quadratic):
     exact = linear_quadratic.riccati(1.0)[1]
     start = gain(RtiNmpc(linear_quadratic.problem, linear_quadratic.wrong()))

@@ -97,6 +97,7 @@ def with_state(rule, **changes):
     )
 
 
+@pytest.mark.slow
 def test_model_parameters_of_theta_are_the_fitted_ones(scenario, features, rng):
     settings = {"model_parameters": ["M", "UA2"]}
     run = make_run("model-based", scenario, settings, start="tuned")
@@ -183,6 +184,7 @@ SMALLER = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path):
     every = {"samples": 60, "log_every": 20, "evaluate_every": 60, "checkpoint_every": 20}
     run = make_run("model-based", scenario, SMALLER, start="tuned", **every)

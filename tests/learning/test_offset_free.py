@@ -26,6 +26,7 @@ def make_run(scenario="paper", settings=None, **changes):
     return training.make_run("offset-free", scenario, settings, **{**values, **every, **changes})
 
 
+@pytest.mark.slow
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
     run = make_run()
     whole = run_training(run)

@@ -14,6 +14,7 @@ def short_run(settings, **changes):
     return make_run("policy-search", "paper", settings, **{**values, **every, **changes})
 
 
+@pytest.mark.slow
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
     run = short_run({"population": 4, "episode": 20})
     whole = run_training(run)

@@ -22,6 +22,7 @@ def operator(penalty_nodes=(20, 20, 4, 2), plant=PLANT):
     return BellmanOperator(plant, Accuracy(8, (7, 7, 2, 2), penalty_nodes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("linear", "quadratic", "state"),
     [(1e5, 1.0, STATE), (1.0, 1e6, STATE - [[0.6, 0.0]])],
@@ -96,6 +97,7 @@ def test_chain_is_stochastic_and_agrees_with_values():
     )
 
 
+@pytest.mark.slow
 def test_model_that_no_step_integrates_is_refused():
     with pytest.raises(OptimumError):
         accurate_substeps(PlantProblem(evaporator_problem(sampling_time=1e5), LAW, P), 1e-7)

@@ -73,6 +73,7 @@ def test_bounds_enclose_the_optimum_in_every_round_and_the_gain_falls():
     assert optimum.upper - optimum.lower <= 1e-7 * optimum.gain
 
 
+@pytest.mark.slow
 def test_number_of_workers_changes_no_bit():
     one, three = (solve(SCALAR.plant, Settings(level=4), workers=workers) for workers in (1, 3))
     assert one.grid.size > 128
@@ -87,6 +88,7 @@ def test_refining_a_solution_equals_solving_finely(scalar_levels):
     assert refined.gain == pytest.approx(fine.gain, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_unstable_plant_that_leaves_its_box_is_refused():
     plant = LinearPlant(
         F=[[1.5]], G=[[0.01]], E=[[1.0]], Q=[[1.0]], R=[[1.0]], sigma=[0.5], bound=1.0

@@ -69,6 +69,7 @@ def test_a_failed_sensor_holds_the_action_and_the_iteration_cap_is_a_failure(exp
     assert capped[0, 2] == 2
 
 
+@pytest.mark.slow
 def test_automatic_goes_on_from_what_the_operator_did_in_manual(exported):
     library = exported / "library.so"
     subprocess.run(
@@ -110,6 +111,7 @@ def test_it_calls_no_more_than_it_says(exported):
     assert "EVAPORATOR_NMPC_STATES = 2,  /* X2, P2 */" in header
 
 
+@pytest.mark.slow
 def test_in_single_precision_a_loop_has_its_actions_and_a_wild_state_is_held(tmp_path, example):
     folder = tmp_path / "single_nmpc"
     run_cosim("export", "tuned", "--format", "c", "--single", "--out", folder, check=True)
@@ -128,6 +130,7 @@ def test_in_single_precision_a_loop_has_its_actions_and_a_wild_state_is_held(tmp
     assert (failed.returncode, "--single goes with --format c" in failed.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_two_controllers_link_into_one_program(exported, tmp_path):
     for name in ("one", "other"):
         scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})

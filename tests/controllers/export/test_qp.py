@@ -63,6 +63,7 @@ def _check(solver: CompiledQpSolver, count: int, peers: tuple[str, ...], seed: i
     return solved
 
 
+@pytest.mark.slow
 def test_the_optimality_conditions_hold_on_every_family(solver: CompiledQpSolver) -> None:
     _check(solver, 1000, (), seed=1)
 

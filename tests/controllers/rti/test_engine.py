@@ -63,7 +63,11 @@ def learnt(request):
     return problem, random_parameters(problem, blocks, np.random.default_rng(7))
 
 
-@pytest.mark.parametrize(("learnt", "gap"), [(10, 1e-12), (20, 1e-11)], indirect=["learnt"])
+@pytest.mark.parametrize(
+    ("learnt", "gap"),
+    [(10, 1e-12), pytest.param(20, 1e-11, marks=pytest.mark.slow)],
+    indirect=["learnt"],
+)
 def test_it_gives_what_the_interpreter_gives(learnt, gap):
     problem, parameters = learnt
     ours, reference = both(problem, parameters)

@@ -81,6 +81,7 @@ def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
 FMI3 = {"plant": {"fmu": "evaporator_fmi3"}, "disturbance": {"law": "normal"}}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_built")
 @pytest.mark.parametrize(
     ("name", "changes", "fmi"), [("reactor", {}, 2), ("tanks", {}, 3), ("paper", FMI3, 3)]
@@ -185,6 +186,7 @@ def test_theta_may_change_between_samples(tmp_path, version):
     assert len({tuple(action) for action in actions}) == len(actions)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_built")
 @pytest.mark.parametrize("version", [2, 3])
 def test_automatic_goes_on_from_what_the_operator_did_in_manual(tmp_path, version):
@@ -218,6 +220,7 @@ def test_automatic_goes_on_from_what_the_operator_did_in_manual(tmp_path, versio
             assert found[1:3] == tuple(given.tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_built")
 def test_a_measured_feed_spares_violations(tmp_path):
     """The actions are the Python controller's with this p; it is θ's own where the sensor fails."""
@@ -245,6 +248,7 @@ def test_a_measured_feed_spares_violations(tmp_path):
     assert violation[True] < 0.9 * violation[False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "package"), [("libcosim", "libcosimpy"), ("ecos", "ecospy.EcosSimulation")]
 )

@@ -20,6 +20,7 @@ def drift(scenario):
     return np.max(np.abs(step.s - s) / np.maximum(np.abs(s), 1e-2))
 
 
+@pytest.mark.slow
 def test_the_evaporators_draft_is_the_paper_but_for_what_nobody_could_know(cosim, tmp_path, paper):
     code, out, err = cosim("scenario", "init", "evaporator")
     assert code == 0

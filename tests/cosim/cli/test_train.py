@@ -43,6 +43,7 @@ def test_train_writes_theta_log_summary_and_recording(trained):
     assert (folder / "training.rrd").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_what_was_learned_is_a_controller(cosim, trained):
     folder, summary = trained
     code, out, _ = cosim("simulate", "-c", folder / "parameters.toml", "-n", 20, "--json")
@@ -50,6 +51,7 @@ def test_what_was_learned_is_a_controller(cosim, trained):
     assert json.loads(out)["parameters_hash"] == summary["parameters_hash"]
 
 
+@pytest.mark.slow
 def test_the_same_command_and_seed_give_the_same_bytes(cosim, trained, tmp_path):
     assert cosim(*SHORT, "--out", "again", "--seed", 5, "--gif")[0] == 0
     with Image.open(tmp_path / "again/learning.gif") as animation:
@@ -64,6 +66,7 @@ def test_explain_lists_every_hyperparameter(cosim):
     assert json.loads(out)["radius"]["meaning"].startswith("trust region")
 
 
+@pytest.mark.slow
 def test_divergence_ends_with_exit_code_1_and_says_why(cosim, undrawn, tmp_path):
     code, out, _ = cosim(
         "train", "-a", "q-learning", "-n", 6000, "--log-every", 500, "--evaluate-every", 1000,
@@ -84,6 +87,7 @@ class Mine(QLearning):
 """
 
 
+@pytest.mark.slow
 def test_a_run_of_an_edited_rule_is_not_resumed(cosim, undrawn, tmp_path):
     (tmp_path / "mine.py").write_text(OWN)
     (tmp_path / "helper_of_mine.py").write_text("X = 1\n")

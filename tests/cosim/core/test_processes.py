@@ -67,6 +67,7 @@ def test_a_child_ends_with_its_parent(number, group):
         assert eventually(lambda: not alive(child))
 
 
+@pytest.mark.slow
 def test_a_child_that_takes_too_long_is_ended_with_its_children(tmp_path):
     program = (
         "import subprocess, sys, signal, time, pathlib\n"

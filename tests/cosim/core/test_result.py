@@ -45,6 +45,7 @@ def test_a_tracker_is_told_of_the_start_each_row_and_the_end(training, followed)
     assert followed.told == [training.run, (20, 20), (40, 40), training]
 
 
+@pytest.mark.slow
 def test_every_result_is_a_line_a_table_and_a_page(run, training, tmp_path):
     scenario = cosim.Scenario.load("paper")
     evaluation = cosim.evaluate(scenario, ["naive"], 2, 10)

@@ -157,6 +157,7 @@ SHAPES = [
 """Training seeds, noise seeds, and the spread that each brings about in J."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("runs", "seeds", "by_run", "by_noise"), SHAPES)
 def test_the_two_way_interval_covers_the_median_at_its_level(
     runs, seeds, by_run, by_noise, monkeypatch
@@ -173,6 +174,7 @@ def test_the_two_way_interval_covers_the_median_at_its_level(
     assert 0.92 < covered / 1000 < 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [5, 10])
 def test_p_is_uniform_where_nothing_differs(runs, monkeypatch):
     """At each value that p can take, so small a p is as likely as p says."""

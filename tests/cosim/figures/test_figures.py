@@ -50,6 +50,7 @@ def test_an_overlay_shows_each_run_and_its_cost(trajectory):
     assert [J in text for text in legend] == [True, True, False]
 
 
+@pytest.mark.slow
 def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
     with FmuPlant(paper) as plant:
         run = simulate(plant, Proportional(paper), 1, 0)

@@ -56,6 +56,7 @@ def test_the_page_holds_every_row_figure_and_definition(results, page):
     assert "2 other seeds × 20 samples" in page
 
 
+@pytest.mark.slow
 def test_a_study_of_baselines_alone_draws_no_course_of_learning(tmp_path):
     baseline = {"name": "grow", "algorithm": GROW, "samples": 200, "group": "baselines"}
     found = run_toy(tmp_path, case=[baseline], training_seeds={"count": 1})

@@ -49,6 +49,7 @@ def test_a_run_s_indicators_are_those_of_its_own_closed_loop(whole):
     assert (row[0], float(row[3])) == ("100001", alone["J"])
 
 
+@pytest.mark.slow
 def test_a_training_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path):
     def interrupted(out):
         toy = case(
@@ -80,6 +81,7 @@ def test_what_is_finished_is_not_done_again_and_more_seeds_are_added(whole, tmp_
         assert len(path.read_text().splitlines()) == 1 + 4
 
 
+@pytest.mark.slow
 def test_a_changed_setting_is_named_and_trained_anew(tmp_path):
     lines = []
 
@@ -110,6 +112,7 @@ def test_burn_in_is_run_and_not_counted(tmp_path):
     assert row[:4] == ["100000", "20", "10", repr(float(cost))]
 
 
+@pytest.mark.slow
 def test_a_failing_case_is_told_at_once_and_the_others_are_done(tmp_path):
     lines = []
     with pytest.raises(FailedRunsError, match="ZeroDivisionError"):

@@ -98,8 +98,6 @@ def test_every_derivative_equals_finite_differences(blocks, hessian):
 @pytest.mark.slow
 @pytest.mark.parametrize(("blocks", "hessian"), KINDS)
 def test_every_derivative_equals_finite_differences_at_many_points(blocks, hessian):
-    if blocks == "paper":
-        pytest.xfail("the differences' noise of a V of 8e5 is larger than its residual says")
     check_derivatives(blocks, hessian, range(FEW * (blocks != "extended"), MANY))
 
 

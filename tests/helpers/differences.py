@@ -46,7 +46,9 @@ def value_error(solution: RtiSolution) -> float:
     gap = np.minimum(np.abs(v - qp.lower), np.abs(v - qp.upper))
     slack = np.maximum(np.maximum(qp.row_lower - qp.rows @ v, qp.rows @ v - qp.row_upper), 0.0)
     rounding = 64 * np.finfo(float).eps * abs(solution.value)
-    return rounding + float((qp.w * slack)[at_limit].sum() + (np.abs(nu) * gap)[held].sum())
+    unmet = float((qp.w * slack)[at_limit].sum() + (np.abs(nu) * gap)[held].sum())
+    # The QP's costs are in units of `Problem.scale`, the value is in the model's.
+    return rounding + float(solution.prepared.functions.problem.scale.cost) * unmet
 
 
 def derivative(

@@ -55,6 +55,8 @@ class Evaluator:
         start_costs = self._costs(self._controller)
         self._start_costs = start_costs["J"]
         self.start = self._metrics(start_costs)
+        self._theta = start.theta
+        self._evaluation = self.start
         # A cost may be negative (a profit): the margin is a share of its magnitude.
         worst = max(self.baselines["naive"], self.start["J"])
         self.limit = worst + (run.divergence - 1) * abs(worst)
@@ -68,8 +70,12 @@ class Evaluator:
             the start's regret that is gone, None where unknown. Intervals are of 95 %, over the
             seeds.
         """
-        self._controller.theta = theta
-        return self._metrics(self._costs(self._controller))
+        # A training ends with the θ of its last row, and a rule may leave θ as it is.
+        if not np.array_equal(theta, self._theta):
+            self._controller.theta = theta
+            self._evaluation = self._metrics(self._costs(self._controller))
+            self._theta = theta.copy()
+        return self._evaluation
 
     def _metrics(self, costs: dict[str, Array]) -> dict[str, Any]:
         """What `evaluate` returns of the indicators of the seeds, (K,) each."""

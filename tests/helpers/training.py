@@ -9,7 +9,8 @@ import pytest
 
 from controllers.rti import RtiNmpc
 from cosim import Scenario
-from learning.algorithm import Algorithm, load_algorithm
+from cosim.core.protocols import Array
+from learning.algorithm import Algorithm, Transition, load_algorithm
 from learning.exploration import Strategy
 from learning.loop import TrainingLoop
 from learning.training import Training, run_training
@@ -72,6 +73,25 @@ def looped(
     loop = TrainingLoop(plant, controller, algorithm, strategy, rng)
     loop.start(plant.reset(seed))
     return loop
+
+
+def bare_transition(number: int, s: Array, a: Array, cost: float, next_s: Array) -> Transition:
+    """A greedy sample within the bounds, without the solutions, for rules that read none."""
+    return Transition(
+        number=number,
+        s=s,
+        a=a,
+        explored=False,
+        solution=None,
+        q_solution=None,
+        stage_cost=cost,
+        cost=cost,
+        next_s=next_s,
+        next_penalty=0.0,
+        next_solution=None,
+        point=None,
+        next_point=None,
+    )
 
 
 class Carrier:

@@ -7,14 +7,13 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim import FmuPlant, simulate
-from learning.algorithm import Transition
 from learning.log import to_csv
 from learning.offset_free import OffsetFree
 from learning.prediction_errors import OneStepModel
 from learning.training import run_training
 from learning.training_run import begin_training
 from tests.helpers import training
-from tests.helpers.training import Carrier, killed_and_resumed
+from tests.helpers.training import Carrier, bare_transition, killed_and_resumed
 
 MEMORY = 40
 
@@ -80,23 +79,7 @@ def fed(scenario, problem, parameters, predict):
         s, a, seen = problem.reference_state, problem.reference_action, []
         expected = predict(s, a)
         for number, error in enumerate(errors):
-            rule.observe(
-                Transition(
-                    number=number,
-                    s=s,
-                    a=a,
-                    explored=False,
-                    solution=None,
-                    q_solution=None,
-                    stage_cost=1.0,
-                    cost=1.0,
-                    next_s=expected + error,
-                    next_penalty=0.0,
-                    next_solution=None,
-                    point=None,
-                    next_point=None,
-                )
-            )
+            rule.observe(bare_transition(number, s, a, 1.0, expected + error))
             seen.append(controller.parameters)
         return seen
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from controllers.factories import tuned
-from learning.algorithm import Transition, load_algorithm
+from learning.algorithm import load_algorithm
+from tests.helpers.training import bare_transition
 
 POPULATION, EPISODE = 4, 30
 
@@ -35,23 +36,7 @@ def searched(scenario, start):
         s, a = scenario.initial_state, scenario.reference_action
         for number in range(POPULATION * EPISODE):
             due = float(cost(*divmod(number, EPISODE)))
-            rule.observe(
-                Transition(
-                    number=number,
-                    s=s,
-                    a=a,
-                    explored=False,
-                    solution=None,
-                    q_solution=None,
-                    stage_cost=due,
-                    cost=due,
-                    next_s=s,
-                    next_penalty=0.0,
-                    next_solution=None,
-                    point=None,
-                    next_point=None,
-                )
-            )
+            rule.observe(bare_transition(number, s, a, due, s))
         return np.array(rule.theta)
 
     return search

@@ -13,14 +13,17 @@ from controllers.rti.nmpc import LinearisationPoint, RtiSolution
 from controllers.theta import Parameters, ThetaBlocks
 
 if TYPE_CHECKING:
+    from controllers.estimator import ExtendedKalmanFilter, OutputFeedback
     from controllers.optimum import OptimalPolicy
 
 __all__ = [
     "ControllerError",
     "ConvergedNmpc",
+    "ExtendedKalmanFilter",
     "LinearisationPoint",
     "Model",
     "OptimalPolicy",
+    "OutputFeedback",
     "Parameters",
     "Problem",
     "QpError",
@@ -32,4 +35,10 @@ __all__ = [
 ]
 
 # Imported on first use: a controller must not pay for the import of SciPy.
-__getattr__, _, _ = lazy_loader.attach(__name__, submod_attrs={"optimum": ["OptimalPolicy"]})
+__getattr__, _, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "estimator": ["ExtendedKalmanFilter", "OutputFeedback"],
+        "optimum": ["OptimalPolicy"],
+    },
+)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import isfinite
 
@@ -58,6 +58,9 @@ class Model:
             of n scalars: the rates of the states.
         economic_cost: Function (x, u, d, p) that returns one scalar ℓ.
         time_unit: Length in seconds of the unit of time in which `ode` counts.
+        outputs: Functions (x, u, d, p) of what is measured and is no state, one scalar each, by the
+            name of the plant's variable. They may depend on x and p alone: a reading is taken
+            before the sample's action is known.
         uncertain: Names of the parameters that a plant may well have otherwise, which
             identification fits where it is not said which.
 
@@ -84,6 +87,7 @@ class Model:
     economic_cost: ModelExpression = field(repr=False)
     time_unit: float = 1.0
     uncertain: tuple[str, ...] = ()
+    outputs: Mapping[str, ModelExpression] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         for kind in KINDS:
@@ -105,18 +109,37 @@ class Model:
             )
         object.__setattr__(self, "uncertain", tuple(self.uncertain))
         self.parameter_indices(self.uncertain)
-        for name, rows in (("ode", len(self.states)), ("economic_cost", 1)):
-            function = getattr(self, name)
-            if not callable(function):
-                raise ModelError(
-                    f"model '{self.name}': {name} must be a function (x, u, d, p), "
-                    f"not {type(function).__name__}"
-                )
-            if isinstance(function, ModelFunction):  # of a copy
-                function = function.function
-            checked = ModelFunction(function, name, self.name, rows)
-            checked.check(self.symbols())
-            object.__setattr__(self, name, checked)
+        object.__setattr__(self, "ode", self._checked("ode", self.ode, len(self.states)))
+        economic_cost = self._checked("economic_cost", self.economic_cost, 1)
+        object.__setattr__(self, "economic_cost", economic_cost)
+        outputs = {}
+        for output, function in self.outputs.items():
+            outputs[output] = self._checked(f"outputs['{output}']", function, 1)
+            self._check_output(outputs[output])
+        object.__setattr__(self, "outputs", outputs)
+
+    def _checked(self, name: str, function: object, rows: int) -> ModelFunction:
+        """A function of the model that returns a column of so many rows; raises ModelError."""
+        if not callable(function):
+            raise ModelError(
+                f"model '{self.name}': {name} must be a function (x, u, d, p), "
+                f"not {type(function).__name__}"
+            )
+        if isinstance(function, ModelFunction):  # of a copy
+            function = function.function
+        checked = ModelFunction(function, name, self.name, rows)
+        checked.check(self.symbols())
+        return checked
+
+    def _check_output(self, output: ModelFunction) -> None:
+        """Refuse an output that depends on what is not known when it is measured."""
+        x, u, d, p = self.symbols()
+        expression = output(x, u, d, p)
+        if ca.depends_on(expression, ca.vertcat(u, d)):
+            raise output.error(
+                "it depends on u or d, which act after the reading is taken: a measured output is "
+                "a function of x and p"
+            )
 
     def _quantities(self, kind: str) -> tuple[Quantity, ...]:
         given = getattr(self, kind)
@@ -219,6 +242,7 @@ class Model:
             parameters=(*self.parameters, *moved),
             ode=rearranged(self.ode),
             economic_cost=rearranged(self.economic_cost),
+            outputs={name: rearranged(output) for name, output in self.outputs.items()},
         )
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:

@@ -90,7 +90,7 @@ class ModelFunction:
             raise self.error(
                 "it returned an MX expression: build it of x, u, d and p, which are SX, alone"
             )
-        function = ca.Function(self.name, list(symbols), [ca.SX(column)], {"allow_free": True})
+        function = ca.Function("checked", list(symbols), [ca.SX(column)], {"allow_free": True})
         free = function.get_free()
         if free:
             raise self.error(

@@ -194,6 +194,9 @@ class OptimalPolicy:
     W are interpolated multilinearly; a state outside the grid's box is moved to the nearest inside.
     """
 
+    given = "truth"
+    """What `feedback` takes, under sensors too: regret is against who sees the state."""
+
     name = "optimal"
 
     def __init__(self, plant: PlantProblem, optimum: Optimum) -> None:
@@ -455,6 +458,9 @@ class QuasiStaticPolicy:
     one sample. A reference, not a bound: it ignores changes to come. For a plant that changes
     infinitely slowly it is the optimum.
     """
+
+    given = "truth"
+    """What `feedback` takes, under sensors too: regret is against who sees the state."""
 
     name = "optimal"
 

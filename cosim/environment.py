@@ -101,7 +101,7 @@ class PlantEnv(gymnasium.Env[Array, Array]):
                 f"an action has shape {self.action_space.shape}, not {np.shape(action)}"
             )
         applied = self.scenario.saturate(action)
-        s, stage_cost, penalty, disturbance = self._plant.step(applied)
+        s, stage_cost, penalty, disturbance, _ = self._plant.step(applied)
         info = {"stage_cost": stage_cost, "penalty": penalty, "disturbance": disturbance}
         self._states.append(s)
         self._actions.append(applied)

@@ -53,6 +53,8 @@ class ActorCritic(Algorithm):
     is 1, that of the mean cost.
     """
 
+    learns_from_estimates = True
+
     Configuration = ActorCriticConfiguration
     configuration: ActorCriticConfiguration
 

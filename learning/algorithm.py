@@ -94,6 +94,8 @@ class Algorithm:
       reset.
     - `needs_q_solution`: whether it reads `Transition.q_solution` where the sample explored.
     - `needs_points`: whether it reads the linearisation points.
+    - `learns_from_estimates`: whether it may run where the scenario has sensors. `s`, `next_s` and
+      the penalties of a transition are then those of the estimated states.
 
     Optional, looked up by name:
 
@@ -118,6 +120,7 @@ class Algorithm:
     requires: ClassVar[Privilege] = "operation"
     needs_q_solution = False
     needs_points = False
+    learns_from_estimates = False
 
     def __init__(
         self,

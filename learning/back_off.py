@@ -424,6 +424,8 @@ class BackOff(Algorithm):
     `theta` is the best θ so far; the controller carries the one that is tried.
     """
 
+    learns_from_estimates = True
+
     Configuration: ClassVar[type[Configuration]] = BackOffConfiguration
     budget: ClassVar[int] = DEFAULT_BUDGET
     explores = False

@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from controllers.estimator import measured, measured_outputs
 from controllers.factories import nmpc, tuned
 from controllers.functions import StackedFunction
 from controllers.model import discretise
@@ -19,6 +20,7 @@ from controllers.theta import Parameters
 from cosim.core.loop import ClosedLoop, Sample
 from cosim.core.protocols import Array, Step
 from cosim.core.scenario import Scenario
+from cosim.core.sensors import Sensors
 from learning.algorithm import Transition
 from learning.back_off import BackOffConfiguration, BackOffSearch
 from learning.empirical_model import displaced
@@ -63,13 +65,13 @@ def back_off(
         return _searched[key]
     plant = GuessedPlant(scenario, deviation)
     controller = nmpc(scenario, start)
-    loop = ClosedLoop(plant.step, controller, scenario)
+    loop = ClosedLoop(plant.step, measured(scenario, controller), scenario)
     rng = np.random.default_rng(0)
     search = BackOffSearch(start, scenario, samples, rng, BackOffConfiguration.from_dict({}))
     while not search.has_ended:
         controller.theta = search.trial.theta
         # A segment begins at the initial state; all of a round meet the same noise.
-        loop.start(plant.reset(search.seed))
+        loop.start(plant.reset(search.seed), plant.y)
         segment_has_ended = False
         while not segment_has_ended:
             sample = loop.advance()
@@ -98,8 +100,9 @@ def add_reserve(
         samples: of the simulation.
     """
     plant = GuessedPlant(scenario, deviation)
-    loop = ClosedLoop(plant.step, nmpc(scenario, start), scenario)
-    loop.start(plant.reset(0))
+    controller = measured(scenario, nmpc(scenario, start))
+    loop = ClosedLoop(plant.step, controller, scenario)
+    loop.start(plant.reset(0), plant.y)
     transitions = []
     # One run: where do the states go, and which bounds are active?
     for _ in range(samples):
@@ -129,10 +132,15 @@ def add_reserve(
 class GuessedPlant:
     """The controller's own model as a plant, its disturbances normal about their nominal values.
 
+    The scenario's sensors measure it as they do the plant.
+
     Args:
-        scenario: names the model.
+        scenario: names the model, and the sensors.
         deviation: standard deviation of each disturbance, as a share of its nominal value: no
             scenario says more on the first day.
+
+    Attributes:
+        y: what the sensors show at the present sample, (n_y,); None without sensors.
     """
 
     def __init__(self, scenario: Scenario, deviation: float) -> None:
@@ -147,13 +155,28 @@ class GuessedPlant:
         self._function = StackedFunction("f", {"x": x, "u": u, "d": d}, results)
         self._nominal = model.nominal_disturbance
         self._magnitudes = model.disturbance_magnitudes
+        self._sensors: Sensors | None = None
+        if scenario.sensors:
+            self._sensors = Sensors(scenario.sensors)
+            self._outputs = measured_outputs(problem, scenario.sensors)
         self.reset(0)
 
     def reset(self, seed: int) -> Array:
         """Start again from the scenario's initial state, with the noise of a seed; the state."""
         self._rng = np.random.default_rng(seed)
         self._s = self.scenario.initial_state
+        self._k = 0
+        self.y: Array | None = None
+        if self._sensors is not None:
+            self.y = self._sensors.start(seed, self._measured())
         return self._s
+
+    def _measured(self) -> list[float]:
+        """Present values of the variables that the sensors read, (n_y,)."""
+        self._outputs.inputs["z"][:] = self._s
+        self._outputs()
+        values: list[float] = self._outputs.part("y").tolist()
+        return values
 
     def step(self, a: Array) -> Step:
         """Hold the action a (m,) for one sampling time."""
@@ -167,8 +190,11 @@ class GuessedPlant:
         function.inputs["d"][:] = d
         function()
         self._s = function.part("y").copy()
+        self._k += 1
+        if self._sensors is not None:
+            self.y = self._sensors.read(self._k, self._measured())
         stage_cost = float(function.part("l")[0])
-        return Step(self._s, stage_cost, self.scenario.state_penalty(s.tolist()), d)
+        return Step(self._s, stage_cost, self.scenario.state_penalty(s.tolist()), d, self.y)
 
 
 def _transition(sample: Sample, scenario: Scenario) -> Transition | None:

@@ -51,6 +51,8 @@ class BatchQLearning(ValueRule):
     filter (Gauss–Newton on the posterior). The first batch also gives noise, widths and c_f.
     """
 
+    learns_from_estimates = True
+
     Configuration = BatchQLearningConfiguration
     needs_points = True
     configuration: BatchQLearningConfiguration

@@ -44,6 +44,8 @@ class Dyna(QLearning):
     Dyna after Sutton (1991).
     """
 
+    learns_from_estimates = False
+
     Configuration: ClassVar[type[QLearningConfiguration]] = DynaConfiguration
     configuration: DynaConfiguration
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from controllers import compile_functions
+from controllers.estimator import measured
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters
@@ -98,4 +99,5 @@ class Evaluator:
         seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
         # All runs together say whether compiling pays.
         compile_functions(policy, self._run.evaluation_steps * len(seeds))
+        policy = measured(self._run.scenario, policy)
         return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)

@@ -11,5 +11,7 @@ from learning.configuration import Configuration, GreedyConfiguration
 class Fixed(Algorithm):
     """θ stays at its start."""
 
+    learns_from_estimates = True
+
     Configuration: ClassVar[type[Configuration]] = GreedyConfiguration
     explores = False

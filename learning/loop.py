@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from controllers.estimator import measured
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.core.loop import ClosedLoop
@@ -94,7 +95,9 @@ class TrainingLoop:
         if algorithm.requires == "simulator":
             self._simulator = plant
             in_operation = plant
-        self._loop = ClosedLoop(in_operation.step, controller, scenario, keeps_points=True)
+        # What runs in the loop; `controller`, behind the estimator if there is one, carries θ.
+        self._law = measured(scenario, controller)
+        self._loop = ClosedLoop(in_operation.step, self._law, scenario, keeps_points=True)
         self.controller = controller
         self.algorithm = algorithm
         self.rng = rng
@@ -105,15 +108,28 @@ class TrainingLoop:
         self._penalty = scenario.state_penalty
         self.counts = Counts()
 
-    def start(self, s: Vector) -> None:
-        """Begin an episode at the state s (n,) to which the plant has been reset."""
-        self._loop.start(s)
+    def start(self, s: Vector, y: Vector | None = None) -> None:
+        """Begin an episode.
+
+        Args:
+            s: state to which the plant has been reset, (n,).
+            y: what its sensors show there, (n_y,); None without sensors.
+        """
+        self._loop.start(s, y)
         self._solve()
 
     @property
     def s(self) -> Vector:
         """Present state, (n,)."""
         return self._loop.s
+
+    @property
+    def known_state(self) -> Vector:
+        """What a rule may know of the present state, (n,): under sensors the estimate."""
+        if self._loop.y is None:
+            return self._loop.s
+        estimate: Vector = self._law.estimate  # type: ignore[attr-defined]
+        return estimate
 
     @property
     def parameters(self) -> Parameters:
@@ -152,7 +168,8 @@ class TrainingLoop:
         self.counts.failures += update.failures
         # A new episode begins; else θ has moved under the present state.
         if update.episode is not None:
-            self.start(self.simulator("episode").reset(update.episode))
+            simulator = self.simulator("episode")
+            self.start(simulator.reset(update.episode), simulator.y)
         else:
             self.renew()
         return cost, update
@@ -173,6 +190,7 @@ class TrainingLoop:
         solution: RtiSolution | None = loop.solution
         point: LinearisationPoint | None = loop.point
         number = self.counts.number
+        s = self.known_state
         a, explored = self._choose(solution)
         # V and Q are one where a = π(s): a greedy sample costs one QP.
         q_solution = solution
@@ -191,18 +209,23 @@ class TrainingLoop:
         cost = step.stage_cost + step.penalty
         if solution is None or q_solution is None or next_solution is None:
             return None, cost
+        # J is of the truth; a rule is told the penalty of the state that it knows.
+        next_s = self.known_state
+        known_cost = cost
+        if sample.y is not None:
+            known_cost = step.stage_cost + self._penalty(s.tolist())
         needs_points = self.algorithm.needs_points
         transition = Transition(
             number=number,
-            s=sample.s,
+            s=s,
             a=a,
             explored=explored,
             solution=solution,
             q_solution=q_solution,
             stage_cost=step.stage_cost,
-            cost=cost,
-            next_s=step.s,
-            next_penalty=self._penalty(step.s.tolist()),
+            cost=known_cost,
+            next_s=next_s,
+            next_penalty=self._penalty(next_s.tolist()),
             next_solution=next_solution,
             point=point if needs_points else None,
             next_point=loop.point if needs_points else None,
@@ -246,7 +269,10 @@ class TrainingLoop:
         self.controller.reset()
         # A failed sample has left no linearisation point.
         if self._loop.point is None:
-            self._solve()
+            # Not by the law, whose estimator has predicted this sample already.
+            self.controller.prepare()
+            self._loop.point = self.controller.linearisation_point
+            self._solve(prepare=False)
         else:
             self.renew()
 
@@ -262,6 +288,10 @@ class TrainingLoop:
             state["algorithm_rng"] = generator_state(self._algorithm_rng)
         if self._loop.point is not None:
             state |= prefixed("point", self._loop.point._asdict())
+        if self._loop.y is not None:
+            state["y"] = self._loop.y
+            law: Any = self._law
+            state |= prefixed("estimator", law.state_dict())
         state |= prefixed("counts", asdict(self.counts))
         state |= prefixed("algorithm", self.algorithm.state_dict())
         return state
@@ -273,6 +303,10 @@ class TrainingLoop:
         self._loop.applied = state["applied"]
         point = part_of(state, "point")
         self._loop.point = LinearisationPoint(**point) if point else None
+        if "y" in state:
+            self._loop.y = state["y"]
+            law: Any = self._law
+            law.load_state_dict(part_of(state, "estimator"))
         self.counts = Counts(**part_of(state, "counts"))
         self.algorithm.load_state_dict(part_of(state, "algorithm"))
         # Only now: a rule may draw while it restores itself.

@@ -106,6 +106,8 @@ class PolicySearch(Algorithm):
     that the budget leaves over changes nothing.
     """
 
+    learns_from_estimates = True
+
     Configuration: ClassVar[type[Configuration]] = PolicySearchConfiguration
     configuration: PolicySearchConfiguration
     explores = False

@@ -340,6 +340,8 @@ class QLearning(ValueRule):
     moves only c_f, which becomes the mean of e (docs/method.md).
     """
 
+    learns_from_estimates = True
+
     Configuration = QLearningConfiguration
     needs_q_solution = True
 

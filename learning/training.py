@@ -16,6 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from controllers import compile_functions
+from controllers.estimator import measured
 from controllers.factories import nmpc
 from controllers.optimum import stored_optimum
 from controllers.rti import RtiNmpc
@@ -146,7 +147,10 @@ class Training(Result):
         return float("nan") if regret is None else float(regret)
 
     def controller(self) -> RtiNmpc:
-        """A fresh controller that has the θ to use."""
+        """A fresh controller of the state that has the θ to use.
+
+        Where the scenario has sensors, `controllers.OutputFeedback` puts the estimator before it.
+        """
         return nmpc(self.run.scenario, self.parameters, self.run.controller)
 
     def log(self) -> dict[str, Array]:
@@ -212,11 +216,12 @@ class Training(Result):
         every = -(-len(rows) // frames)
         runs = {}
         with FmuPlant(run.scenario) as plant:
-            first = simulate(plant, policy, steps, seed)
+            law = measured(run.scenario, policy)
+            first = simulate(plant, law, steps, seed)
             for row in rows[::every]:
                 policy.theta = row.parameters.theta
                 title = f"after {row['samples']:.0f} samples"
-                runs[title] = simulate(plant, policy, steps, seed)
+                runs[title] = simulate(plant, law, steps, seed)
         return animation(Path(run.start).stem, first, run.algorithm, runs, path)
 
     def save(self, folder: str | Path) -> Path:

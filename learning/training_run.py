@@ -253,6 +253,11 @@ def begin_training(
         algorithm: class of its rule.
         plant: of its scenario.
     """
+    if run.scenario.sensors and not getattr(algorithm, "learns_from_estimates", False):
+        raise ConfigurationError(
+            f"{run.algorithm} learns from exact states, and scenario '{run.scenario.name}' has "
+            "sensors: use an algorithm that learns from estimates, such as q-learning"
+        )
     # Each source of randomness has its own stream, so that settings keep runs paired.
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
     strategy = Strategy(run.configuration, run.scenario)
@@ -266,9 +271,10 @@ def begin_training(
     loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, algorithm_rng)
     first_episode = getattr(rule, "first_episode", None)
     if first_episode is None:
-        loop.start(plant.reset(plant_seed))
+        loop.start(plant.reset(plant_seed), plant.y)
     else:
-        loop.start(loop.simulator("first_episode").reset(first_episode))
+        simulator = loop.simulator("first_episode")
+        loop.start(simulator.reset(first_episode), simulator.y)
     return loop
 
 

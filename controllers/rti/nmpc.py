@@ -1142,9 +1142,10 @@ class RtiNmpc:
 
 
 def compile_functions(controller: object, samples: int = LONG) -> None:
-    """Compile the controller if it is an `RtiNmpc`; do nothing for others."""
-    if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
-        controller.compile(samples)
+    """Compile the controller if it is an `RtiNmpc`, behind an estimator too; no other."""
+    nmpc = getattr(controller, "controller", controller)
+    if isinstance(nmpc, RtiNmpc) and nmpc.functions == INTERPRETED:
+        nmpc.compile(samples)
 
 
 def _alike(one: Vector, other: Vector) -> bool:

@@ -31,6 +31,11 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
 
     Raises ControllerLookupError where it is no RTI-NMPC, ModelError on a name that the model lacks.
     """
+    if scenario.sensors:
+        raise ControllerLookupError(
+            f"scenario '{scenario.name}' has sensors, and an estimator cannot be exported: export "
+            "the controller of the state, from the same scenario without [[sensor]]"
+        )
     controller: Any = build_controller(name, scenario)
     if type(controller) is not RtiNmpc or controller.iterations != 1:
         raise ControllerLookupError(

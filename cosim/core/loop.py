@@ -22,6 +22,8 @@ class Sample(NamedTuple):
 
     Attributes:
         s: state x_k, (n,).
+        y: what the sensors showed at sample k, (n_y,); None without sensors.
+        estimate: the controller's of x_k, (n,); None where it makes none.
         solution: the controller's; None after a failed solve.
         a: applied action u_k, (m,).
         step: what the plant gave, x_{k+1} included.
@@ -29,6 +31,8 @@ class Sample(NamedTuple):
     """
 
     s: Array
+    y: Array | None
+    estimate: Array | None
     solution: Solution | None
     a: Array
     step: Step
@@ -41,9 +45,10 @@ class ClosedLoop:
     """A plant and a controller in closed loop.
 
     A sample is `prepare`, then `feedback(s)`, then the plant steps under the action, saturated to
-    the actuators' bounds. A failed solve is an exception whose class has `is_solver_failure`: the
-    last applied action (first the reference action) is then applied once more, and the controller
-    is reset. Every other error is raised.
+    the actuators' bounds. Where the plant has sensors the controller is given y in place of s. A
+    failed solve is an exception whose class has `is_solver_failure`: the last applied action (first
+    the reference action) is then applied once more, and the controller is reset. Every other error
+    is raised.
 
     Args:
         step: the plant, from an action (m,) to what its next sample gave.
@@ -54,6 +59,7 @@ class ClosedLoop:
     Attributes:
         lower, upper: bounds of the actuators, (m,).
         s: present state, (n,).
+        y: what the sensors show at the present sample, (n_y,); None without sensors.
         number: of samples since the start.
         applied: action of the last sample, (m,); before the first, the reference action.
         solution: for the present state, once it is solved for; None after a failed solve.
@@ -74,7 +80,12 @@ class ClosedLoop:
         self.lower = limits.action_lower
         self.upper = limits.action_upper
         self._keeps_points = keeps_points
+        # Optional methods of a controller that is given measurements (`Controller`).
+        self._report_action = getattr(controller, "applied", None)
+        self._resume = getattr(controller, "resume", controller.reset)
+        self._given = getattr(controller, "given", "state")
         self.s: Array = np.empty(0)
+        self.y: Array | None = None
         self.number = 0
         self.applied = limits.reference_action
         self.solution: Any = None
@@ -82,10 +93,25 @@ class ClosedLoop:
         self._prepare_time = 0.0
         self._feedback_time = 0.0
 
-    def start(self, s: Array) -> None:
-        """Begin an episode at the state s (n,), to which the plant has been reset."""
+    def start(self, s: Array, y: Array | None = None) -> None:
+        """Begin an episode.
+
+        Args:
+            s: state to which the plant has been reset, (n,).
+            y: what its sensors show there, (n_y,); None without sensors.
+
+        Raises:
+            CosimError: the plant has sensors, and the controller is made for exact states.
+        """
+        if y is not None and self._given == "state":
+            raise CosimError(
+                f"the scenario has sensors, and {controller_name(self._controller)} takes the "
+                "exact state: put an estimator before it, "
+                "controllers.OutputFeedback.from_scenario(scenario, controller)"
+            )
         s.flags.writeable = False
         self.s = s
+        self.y = y
         self.number = 0
         self.applied = self._limits.reference_action
         self._controller.reset()
@@ -94,6 +120,13 @@ class ClosedLoop:
         """Solve for the present state, and let the plant take a sample under the action."""
         self.solve()
         return self.step(self.action())
+
+    @property
+    def given(self) -> Array:
+        """What the controller is given at the present sample: y (n_y,) or the state (n,)."""
+        if self.y is None or self._given == "truth":
+            return self.s
+        return self.y
 
     def solve(self, *, prepare: bool = True) -> bool:
         """Prepare, and feed the present state back, into `solution`.
@@ -116,7 +149,7 @@ class ClosedLoop:
                 if self._keeps_points:
                     self.point = self._controller.linearisation_point  # type: ignore[attr-defined]
                 middle = perf_counter()
-            self.solution = self._controller.feedback(self.s)
+            self.solution = self._controller.feedback(self.given)
             end = perf_counter()
             self._check_solution()
         except Exception as error:
@@ -133,7 +166,7 @@ class ClosedLoop:
             a: action that is enforced, (m,).
         """
         try:
-            return self._controller.feedback(self.s, a)
+            return self._controller.feedback(self.given, a)
         except Exception as error:
             self._recover(error)
             return None
@@ -171,14 +204,28 @@ class ClosedLoop:
         begin = perf_counter()
         step = self._step(a)
         plant_time = perf_counter() - begin
+        estimate = None
+        if self.y is not None:
+            estimate = getattr(self._controller, "estimate", None)
         sample = Sample(
-            self.s, self.solution, a, step, self._prepare_time, self._feedback_time, plant_time
+            self.s,
+            self.y,
+            estimate,
+            self.solution,
+            a,
+            step,
+            self._prepare_time,
+            self._feedback_time,
+            plant_time,
         )
         # Controllers and rules read these arrays, and may keep them.
         a.flags.writeable = False
         step.s.flags.writeable = False
         self.s = step.s
+        self.y = step.y
         self.applied = a
+        if self._report_action is not None:
+            self._report_action(a)
         self.number += 1
         return sample
 
@@ -206,7 +253,7 @@ class ClosedLoop:
         if not getattr(type(error), "is_solver_failure", False):
             raise error
         # What led to the failure is forgotten: the next sample is solved from the reference.
-        self._controller.reset()
+        self._resume()
         self.solution = None
         self.point = None
 

@@ -66,6 +66,10 @@ class ControllerSource:
                 f"unknown controller '{name}'{suggestion(name, known)}; give one of "
                 f"{', '.join(sorted(known))}, a parameters file (.toml), or module:factory"
             )
+        if scenario.sensors:
+            # By its name, as above.
+            wrap = load_plugin("controllers.estimator:measured", "estimator", ControllerLookupError)
+            controller = wrap(scenario, controller)
         with suppress(AttributeError):  # as the user calls it, for tables and recordings
             setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
         return controller

@@ -27,12 +27,15 @@ class Step(NamedTuple):
         stage_cost: ℓ(x_k, u_k, d_k), without penalty.
         penalty: that of x_k at the scenario's true bounds.
         disturbance: d_k, (p,).
+        y: what the scenario's sensors show at sample k+1, (n_y,), NaN where nothing new came; None
+            without sensors, where each state is known exactly at each sample.
     """
 
     s: Array
     stage_cost: float
     penalty: float
     disturbance: Array
+    y: Array | None = None
 
 
 class Plant(Protocol):
@@ -112,8 +115,16 @@ class Decision(NamedTuple):
 class Controller(Protocol):
     """A feedback law in two phases: `prepare` before the state is known, `feedback` after.
 
-    Optional attributes that are used when present: `name` (str), `parameters` (with `.hash`) and
-    `functions`, which says how its functions are computed.
+    Optional attributes that are used when present: `name` (str), `parameters` (with `.hash`),
+    `functions`, which says how its functions are computed, and those of a controller for a scenario
+    with sensors:
+
+    - `given`: what `feedback` takes, `"state"` (if it says nothing), `"measurement"` (y, with NaN
+      where nothing new came), or `"truth"` (the state, which only a yardstick may see);
+    - `applied(a)`: is called with each action that was applied, saturated and explored;
+    - `resume()`: is called in place of `reset` after a failed solve, to keep the estimate;
+    - `estimate`: of the state, (n,), for records.
+
     An exception whose class has `is_solver_failure = True` makes the loop apply its fallback.
     """
 

@@ -167,6 +167,35 @@ class ExplorationTable(Table):
     """σ in the units of the actions, (m,)."""
 
 
+class SensorTable(Table):
+    """A sensor: what is measured, how exactly, how often and how late."""
+
+    variable: Name
+    """The FMU's variable that it reads: a state, or any output or local variable."""
+    deviation: NonNegative = 0.0
+    """Standard deviation of its normal noise, in the variable's unit."""
+    every: Annotated[int, Field(ge=1)] = 1
+    """It takes a reading at each so many-th sample, the first at k = 0."""
+    delay: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Samples from taking a reading to its arrival."""
+
+
+class EstimatorTable(Table):
+    """The estimator of the state, for controllers that are given what sensors measure."""
+
+    kind: Annotated[str, Field(pattern=r"^(ekf|none|[\w.]+:\w+)$")] = "ekf"
+    """`ekf`: an extended Kalman filter on the controller's model. `none`: the controller gets the
+    readings as they are. `module:factory`: a factory(scenario) of an estimator."""
+    disturbance_deviation: NonNegatives | None = None
+    """Standard deviation that the filter expects of each disturbance of the controller's model;
+    without it a tenth of the disturbance's magnitude."""
+    sensor_deviation: NonNegatives | None = None
+    """Standard deviation that the filter expects of each sensor; without it the sensor's own."""
+    parameter_drift: NonNegative = 0.1
+    """Deviation that the filter expects of the daily change of each uncertain parameter of the
+    controller's model, as a share of its nominal value; 0 takes the parameters as they are."""
+
+
 class ControllerTable(Table):
     """The controller's model, solver and operating point."""
 
@@ -295,12 +324,19 @@ class Scenario(Shown, Table):
     """Table `[exploration]`: how training explores; without it the algorithm decides."""
     controller: ControllerTable
     """Table `[controller]`: what the controller is told."""
+    sensors: Annotated[
+        tuple[SensorTable, ...] | None, Field(alias="sensor", min_length=1, strict=False)
+    ] = None
+    """Tables `[[sensor]]`: what is measured; without any each state, exactly, at each sample."""
+    estimator: EstimatorTable | None = None
+    """Table `[estimator]`, where there are sensors."""
 
     @model_validator(mode="after")
     def _sizes_and_signs_fit(self) -> Self:
         self._check_sizes()
         self._check_bounds()
         self._check_times()
+        self._check_sensors()
         plant = self.plant
         law = self.disturbance.law
         names = (*plant.states, *plant.actions, *plant.disturbances)
@@ -372,6 +408,24 @@ class Scenario(Shown, Table):
         for time, next_time in pairwise(times):
             if time >= next_time:
                 raise ValueError("plant.changes: must have increasing times")
+
+    def _check_sensors(self) -> None:
+        """Raise ValueError where two sensors read one variable, or an estimator has none."""
+        sensors = self.sensors or ()
+        names = [sensor.variable for sensor in sensors]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"sensor: two of them read '{name}'")
+        if self.estimator is None:
+            return
+        if not sensors:
+            raise ValueError("estimator: there is no [[sensor]] that it could read")
+        expected = self.estimator.sensor_deviation
+        if expected is not None and len(expected) != len(sensors):
+            raise ValueError(
+                f"estimator.sensor_deviation: must have one entry per sensor ({len(sensors)}), "
+                f"not {len(expected)}"
+            )
 
     def _facts(self) -> dict[str, object]:
         plant = self.plant
@@ -471,6 +525,18 @@ class Scenario(Shown, Table):
     """Operating point x_s, (n,)."""
     reference_action = _array("controller.reference_action")
     """Operating point u_s, (m,)."""
+
+    @property
+    def measurement_names(self) -> tuple[str, ...]:
+        """Names of the sensors' signals, `measured[X2]` say; none without sensors."""
+        return tuple(f"measured[{sensor.variable}]" for sensor in self.sensors or ())
+
+    @property
+    def estimate_names(self) -> tuple[str, ...]:
+        """Names of the estimated states' signals, `estimated[X2]` say; none without sensors."""
+        if not self.sensors:
+            return ()
+        return tuple(f"estimated[{name}]" for name in self.plant.states)
 
     @cached_property
     def limits(self) -> dict[str, tuple[float, float]]:

@@ -18,9 +18,12 @@ from cosim.core.validation import whole_number
 
 MEASURED = (
     "states", "actions", "stage_cost", "disturbances", "value", "residual", "failed",
-    "prepare_time", "feedback_time", "plant_time",
+    "prepare_time", "feedback_time", "plant_time", "measurements", "estimates",
 )  # fmt: skip
-"""Signals in a row of the loop's table, in order (`cosim.core.protocols.CompiledLoop`)."""
+"""Signals in a row of the loop's table, in order (`cosim.core.protocols.CompiledLoop`).
+
+The last two are there with sensors, under which no compiled loop runs.
+"""
 REFRESH = 0.1
 """Seconds between two drawings of a progress bar, at least."""
 PREDICTED = ("predicted_states", "predicted_actions")
@@ -147,6 +150,7 @@ class _Run:
         self._ends = np.cumsum([widths[name] for name in MEASURED])
         self._status: list[str] = []
         self._predicted: dict[str, Array] = {}
+        self._without_estimate = np.full(len(scenario.estimate_names), nan)
         self._final_state: Array | None = None
         self.done = 0
 
@@ -161,7 +165,8 @@ class _Run:
         """
         rows: list[list[float]] = []
         loop = self._loop
-        loop.start(self._plant.reset(spawn_seeds(self._seed)[0]))
+        s = self._plant.reset(spawn_seeds(self._seed)[0])
+        loop.start(s, getattr(self._plant, "y", None))
         try:
             for k in range(self._steps):
                 sample = loop.advance()
@@ -189,7 +194,7 @@ class _Run:
             value = self._number(solution, "value")
             if self._residuals:
                 residual = self._number(solution, "residual")
-        return [
+        row = [
             *sample.s.tolist(),
             *sample.a.tolist(),
             step.stage_cost,
@@ -201,6 +206,10 @@ class _Run:
             sample.feedback_time,
             sample.plant_time,
         ]
+        if sample.y is not None:
+            estimate = self._without_estimate if sample.estimate is None else sample.estimate
+            row += [*sample.y.tolist(), *estimate.tolist()]
+        return row
 
     def _store(self, rows: list[list[float]], record: Callable[..., None] | None) -> None:
         """Store the rows that are not stored yet, hand them to the recorder, and forget them."""

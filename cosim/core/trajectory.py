@@ -6,6 +6,7 @@ import csv
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -31,11 +32,11 @@ class SignalKind:
     """A declared signal.
 
     Attributes:
-        name: its name; of a vector, the field of the scenario's plant that names its variables.
+        name: its name.
         derive: computes it from other signals; None: the loop measures it.
         unit: of a signal that is no vector; each variable of a vector has its own.
         group: where a recording shows it; None: nowhere.
-        vector: whether it has a signal for each variable.
+        vector: of a vector, the field of the scenario that names its signals; "": it is none.
         whole: whether it is 0 or 1.
         clock: whether it is a wall-clock time, which the trajectory's file leaves out.
     """
@@ -44,13 +45,16 @@ class SignalKind:
     derive: Derived | None = None
     unit: str = ""
     group: Group | None = "unseen"
-    vector: bool = False
+    vector: str = ""
     whole: bool = False
     clock: bool = False
 
     def names(self, scenario: Scenario) -> tuple[str, ...]:
         """Names of the signals, one but for a vector."""
-        return getattr(scenario.plant, self.name) if self.vector else (self.name,)
+        if not self.vector:
+            return (self.name,)
+        names: tuple[str, ...] = attrgetter(self.vector)(scenario)
+        return names
 
     def units(self, scenario: Scenario, known: Mapping[str, str]) -> dict[str, str]:
         """Unit of each signal by name.
@@ -77,9 +81,11 @@ def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
 # Loop, CSV, recording and comparison follow this table: a derived signal is declared here alone.
 SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("time", unit="s"),
-    SignalKind("states", group="states", vector=True),
-    SignalKind("actions", group="actions", vector=True),
-    SignalKind("disturbances", group="disturbances", vector=True),
+    SignalKind("states", group="states", vector="plant.states"),
+    SignalKind("actions", group="actions", vector="plant.actions"),
+    SignalKind("disturbances", group="disturbances", vector="plant.disturbances"),
+    SignalKind("measurements", group="states", vector="measurement_names"),
+    SignalKind("estimates", group="states", vector="estimate_names"),
     SignalKind("stage_cost", unit=COST, group="costs"),
     SignalKind("penalty", _penalty, COST, "costs"),
     SignalKind("violation", _violation),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import operator
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ import numpy as np
 from cosim.core.errors import CapabilityError, PlantError
 from cosim.core.protocols import Array, CompiledLoop, Step
 from cosim.core.scenario import Scenario
+from cosim.core.sensors import Sensors
 from cosim.plant.fmi import NOT_FINITE_STATUS, Instance, Intermediate, unpack
 from cosim.plant.probe import Restart, as_asked, probe_of, subject_of
 from cosim.plant.wiring import Wiring, refusals, seed_words
@@ -34,6 +36,7 @@ class Snapshot:
     instance: Instance
     handle: ctypes.c_void_p
     k: int
+    sensors: tuple[int, Array] | None = None
 
     def __del__(self) -> None:
         self.plant.recycle(self.instance, self.handle)
@@ -58,6 +61,8 @@ class FmuPlant:
         units: unit of each variable of the scenario, by name.
         state_range: least and greatest values of the states, (n,) each, as the FMU states them.
         drivable: whether compiled code can step the FMU (`drive`).
+        y: what the scenario's sensors show at the present sample, (n_y,), NaN where nothing new
+            came; None without sensors.
 
     Raises:
         PlantError: the FMU is missing, corrupt, has no co-simulation binary for this platform or
@@ -88,7 +93,15 @@ class FmuPlant:
         self.fmu_sha256 = archive.sha256
         plant = self.scenario.plant
         names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
-        self.units = {name: archive.unit(name) for name in names}
+        sensors = self.scenario.sensors or ()
+        variables = [sensor.variable for sensor in sensors]
+        self.units = {name: archive.unit(name) for name in (*names, *variables)}
+        for sensor, name in zip(sensors, self.scenario.measurement_names, strict=True):
+            self.units[name] = self.units[sensor.variable]
+        for name, estimate in zip(plant.states, self.scenario.estimate_names, strict=False):
+            self.units[estimate] = self.units[name]
+        self._sensors = Sensors(sensors) if sensors else None
+        self.y: Array | None = None
         ranges = np.array([archive.range(name) for name in plant.states])
         self.state_range = ranges[:, 0], ranges[:, 1]
         self.penalty = self.scenario.state_penalty
@@ -96,6 +109,7 @@ class FmuPlant:
         self._initial = wiring.initial
         self._asked = list(plant.initial_state)
         self._elsewhere = False
+        self._n = len(plant.states)
         self._m = len(plant.actions)
         self._k = _NOT_STARTED
         self._started = False
@@ -137,26 +151,34 @@ class FmuPlant:
         wiring = self._wiring
         fmi = self._fmi = wiring.interface(
             self.unpacked,
-            (wiring.inputs, wiring.outputs, wiring.states),
+            # The sensors' variables are read with the states, behind these.
+            (wiring.inputs, wiring.outputs, [*wiring.states, *wiring.sensors]),
             wiring.starts,
             self._h / self._steps,
             self._reading,
             self._probe.findings.experiment,
             self._intermediate and self._since_reset,
         )
-        self.drivable = fmi.drivable and self._steps == 1 and self._intermediate is None
+        in_one_step = self._steps == 1 and self._intermediate is None
+        self.drivable = fmi.drivable and in_one_step and self._sensors is None
         self._changes = {k: fmi.writer(*change) for k, change in wiring.changes().items()}
         self._advance = fmi.advance if self._steps == 1 else self._advance_in_steps
         self._inputs = fmi.inputs
         self._outputs = fmi.outputs
-        self._states = fmi.states
-        self._copy_states = fmi.states_view.copy
+        self._exchanged = fmi.states
+        self._copy_states = fmi.states_view[: self._n].copy
         self._copy_disturbances = fmi.outputs_view[1:].copy
+
+    @property
+    def _states(self) -> list[float]:
+        """Present state as numbers, (n,)."""
+        states: list[float] = self._exchanged[: self._n]
+        return states
 
     def _since_reset(self, time: float, states: Array) -> None:
         """Tell of an internal step, at its time since the reset."""
         assert self._intermediate is not None
-        self._intermediate(time - self._start_time, states)
+        self._intermediate(time - self._start_time, states[: self._n])
 
     @property
     def k(self) -> int:
@@ -198,11 +220,13 @@ class FmuPlant:
             self._start_from(fmi, initial_state)
         self._k = _NOT_STARTED
         fmi.initialise(self._started)
-        if self._initial and self._states[:] != self._asked:
+        if self._initial and self._states != self._asked:
             self._check_initial_state()
         self._started = True
         self._k = 0
-        self._penalty_now = self.penalty(self._states[:])
+        self._penalty_now = self.penalty(self._states)
+        if self._sensors is not None:
+            self.y = self._sensors.start(operator.index(seed), self._exchanged[self._n :])
         return self._copy_states()
 
     def _begin_anew(self) -> Instance:
@@ -252,13 +276,15 @@ class FmuPlant:
         if self._changes and k in self._changes:
             self._changes[k]()
         self._advance(self._start_time + k * self._h)
-        states = self._states[:]
+        exchanged = self._exchanged[:]
         cost = self._outputs[0]
-        if not isfinite(cost + sum(states)):
+        if not isfinite(cost + sum(exchanged)):
             self._refuse_output(k)
         self._k = k + 1
-        self._penalty_now = self.penalty(states)
-        return Step(self._copy_states(), cost, penalty, self._copy_disturbances())
+        self._penalty_now = self.penalty(exchanged[: self._n])
+        if self._sensors is not None:
+            self.y = self._sensors.read(k + 1, exchanged[self._n :])
+        return Step(self._copy_states(), cost, penalty, self._copy_disturbances(), self.y)
 
     def _advance_in_steps(self, time: float) -> None:
         """Step through a sample; the outputs are those of its first step."""
@@ -302,7 +328,7 @@ class FmuPlant:
             if fault:
                 fmi.fail_native(fault, status)
         self._k = end
-        self._penalty_now = self.penalty(self._states[:])
+        self._penalty_now = self.penalty(self._states)
         return self._copy_states()
 
     def snapshot(self) -> Snapshot:
@@ -315,13 +341,17 @@ class FmuPlant:
             self._saves = True
         handle = self._handle(fmi)
         fmi.save(handle)
-        return Snapshot(self, fmi, handle, self._k)
+        sensors = None if self._sensors is None else self._sensors.state()
+        return Snapshot(self, fmi, handle, self._k, sensors)
 
     def restore(self, snapshot: Snapshot) -> Array:
         """Go back to a snapshot; return its state (n,). Raises PlantError on another plant's."""
         self._require_own(snapshot).load(snapshot.handle)
         self._k = snapshot.k
-        self._penalty_now = self.penalty(self._states[:])
+        self._penalty_now = self.penalty(self._states)
+        if self._sensors is not None and snapshot.sensors is not None:
+            self._sensors.restore(snapshot.sensors)
+            self.y = self._sensors.read(self._k, self._exchanged[self._n :])
         return self._copy_states()
 
     def serialise(self, snapshot: Snapshot) -> bytes:
@@ -330,7 +360,10 @@ class FmuPlant:
         fmi.require_serialised_state()
         self._require_proof(self._probe.serialises, "serialise")
         state = fmi.serialise(snapshot.handle)
-        return _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256)) + state
+        header = _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256))
+        if self._sensors is None or snapshot.sensors is None:
+            return header + state
+        return header + self._sensors.to_bytes(snapshot.sensors) + state
 
     def deserialise(self, data: bytes) -> Snapshot:
         """A snapshot from its bytes; raises PlantError where they are not of the same FMU file."""
@@ -347,8 +380,12 @@ class FmuPlant:
         if not self._started:
             self.reset(0)
         handle = self._handle(fmi)
-        fmi.deserialise(data[_HEADER.size :], handle)
-        return Snapshot(self, fmi, handle, k)
+        state = data[_HEADER.size :]
+        sensors = None
+        if self._sensors is not None:
+            sensors, state = self._sensors.from_bytes(state)
+        fmi.deserialise(state, handle)
+        return Snapshot(self, fmi, handle, k, sensors)
 
     def _require_proof(self, fault: str, ability: str) -> None:
         if fault:
@@ -441,6 +478,7 @@ class FmuPlant:
     def _refuse_output(self, k: int) -> NoReturn:
         table = self.scenario.plant
         values = {table.stage_cost: self._outputs[0]}
-        values |= dict(zip(table.states, self._states, strict=True))
+        variables = [sensor.variable for sensor in self.scenario.sensors or ()]
+        values |= dict(zip((*table.states, *variables), self._exchanged, strict=True))
         bad = ", ".join(f"{name} = {x}" for name, x in values.items() if not isfinite(x))
         raise PlantError(f"FMU '{self.fmu_path.name}' returned {bad} at step {k}")

@@ -129,6 +129,7 @@ class Wiring:
     Attributes:
         inputs, states: places of the actions and states.
         outputs: places of the stage cost, which is the first, and the disturbances.
+        sensors: places of the variables that sensors read.
         seeds: places of the seed's words, low word first.
         initial: places of the parameters for the initial state.
         starts: places and values of all start values.
@@ -146,6 +147,8 @@ class Wiring:
         self.experiment = experiment(fmu, plant)
         self.outputs = self._number_places((plant.stage_cost, *plant.disturbances), "plant")
         self.states = self._number_places(plant.states, "plant.states")
+        variables = [sensor.variable for sensor in scenario.sensors or ()]
+        self.sensors = self._number_places(variables, "sensor")
         self.initial = self._number_places(mapping.initial_state, "plant.mapping.initial_state")
         self.seeds: list[Place] = []
         for name in mapping.seed:

@@ -13,6 +13,7 @@ import pandas as pd
 from scipy.stats import ttest_1samp
 
 from controllers import compile_functions
+from controllers.estimator import measured
 from controllers.factories import nmpc
 from controllers.optimum import QuasiStaticPolicy, fouling, frozen
 from cosim.core.errors import StudyError
@@ -127,7 +128,8 @@ def _cost_of_the_start(run: TrainingRun, plant: FmuPlant) -> Array:
     """Cost (K,) of each sample of a run if θ stayed as it starts."""
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
     compile_functions(controller, run.samples)
-    signals = simulate(plant, controller, run.samples, run.seed, residuals=False).signals
+    law = measured(run.scenario, controller)
+    signals = simulate(plant, law, run.samples, run.seed, residuals=False).signals
     return signals["stage_cost"].values + signals["penalty"].values
 
 

@@ -1,0 +1,491 @@
+"""Output feedback: an extended Kalman filter on the controller's model, before any controller.
+
+The filter has the states of the controller's model, x₊ = f(x, u, d, p), and those of its parameters
+p that the model calls uncertain: without these it would blame the state for what a wrong parameter
+does, and stay off. The disturbances d are taken as white noise about their nominal values, the
+uncertain parameters as random walks, each sensor's noise as white. A reading that arrives late is
+one of an earlier state: the filter keeps as many earlier states as the latest sensor needs.
+
+Source: Anderson and Moore, Optimal Filtering, 1979, ch. 8.2 (extended filter), ch. 7.3 (the state
+augmented by delayed ones).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from controllers.errors import ControllerError, ModelError
+from controllers.functions import StackedFunction
+from controllers.model import discretise
+from controllers.problem import Problem
+from cosim.core.modules import load_plugin
+from cosim.core.protocols import Controller, Matrix, Solution, Vector
+from cosim.core.scenario import EstimatorTable, Scenario, SensorTable
+
+EXPECTED_DISTURBANCE = 0.1
+"""Deviation that is expected of a disturbance, as a share of its magnitude."""
+INITIAL_DEVIATION = 0.1
+"""Deviation of the first state from the reference, as a share of the width of its bounds."""
+UNCERTAIN = 0.1
+"""Deviation of an uncertain parameter from its nominal value at the start, as a share of this."""
+DAY = 86400.0
+"""Seconds."""
+EXACT = 1e-6
+"""Deviation of a sensor that is called exact, as a share of its variable's size: no rounding."""
+UNSEEN = 1e-8
+"""Share of the largest singular value below which a direction counts as not observed."""
+
+
+ESTIMATOR_METHODS = ("predict", "correct", "reset", "state_dict", "load_state_dict")
+
+
+class Estimator(Protocol):
+    """What estimates the state from the readings.
+
+    A sample is `correct(y)`, after the first one preceded by `predict(a)` with the action that was
+    applied.
+    """
+
+    @property
+    def estimate(self) -> Vector:
+        """Of the present state, (n,)."""
+
+    def reset(self) -> None:
+        """Forget every reading."""
+
+    def predict(self, a: Vector) -> None:
+        """Go on by a sample under the action a (m,)."""
+
+    def correct(self, y: Vector) -> Vector:
+        """Take up the readings y (n_y,), NaN where there is none; returns the estimate (n,)."""
+
+    def state_dict(self) -> dict[str, Vector]:
+        """Arrays that are all it remembers."""
+
+    def load_state_dict(self, state: Mapping[str, Vector]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class ExtendedKalmanFilter:
+    """An extended Kalman filter on a problem's model.
+
+    Args:
+        problem: Has the model with its nominal disturbances and parameters, and the reference, from
+            which the first estimate starts.
+        sensors: What is measured, n_y sensors of states of the model or of its `outputs`.
+        disturbance_deviation: Expected deviations of the model's disturbances, (n_d,); without them
+            a tenth of their magnitudes.
+        sensor_deviation: Expected deviations of the sensors, (n_y,); without them their own.
+        parameter_drift: Expected deviation of an uncertain parameter's change in a day, as a share
+            of its nominal value; 0 takes the model's parameters as they are.
+
+    Raises:
+        ModelError: A sensor reads what is neither a state nor an output of the model, or a
+            disturbance's size is not known.
+        ControllerError: The sensors do not show a part of the state that does not decay.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        sensors: Sequence[SensorTable],
+        *,
+        disturbance_deviation: ArrayLike | None = None,
+        sensor_deviation: ArrayLike | None = None,
+        parameter_drift: float = 0.1,
+    ) -> None:
+        self._problem = problem
+        self._sensors = tuple(sensors)
+        self._delays = np.array([sensor.delay for sensor in sensors])
+        self._longest = int(self._delays.max())
+        model = problem.model
+        self._uncertain = model.parameter_indices(model.uncertain) if parameter_drift > 0 else []
+        self._transition = _transition(problem, self._uncertain)
+        self._output = measured_outputs(problem, sensors, self._uncertain)
+        # The filter's state z: the model's, and its uncertain parameters.
+        nominal = model.nominal_parameters[self._uncertain]
+        self._reference = np.concatenate([problem.reference_state, nominal])
+        self._n = self._reference.size
+        share = parameter_drift * np.sqrt(problem.sampling_time / DAY)
+        drifts = np.concatenate([np.zeros(problem.n_states), share * np.abs(nominal)])
+        self._drift_variance = np.diag(drifts**2)
+        self._initial_deviation = np.concatenate(
+            [INITIAL_DEVIATION * _widths(problem), UNCERTAIN * np.abs(nominal)]
+        )
+        if disturbance_deviation is None:
+            expected = EXPECTED_DISTURBANCE * model.disturbance_magnitudes
+        else:
+            expected = _of_size("disturbance_deviation", disturbance_deviation, model.disturbances)
+        self._disturbance_variance = expected**2
+        if sensor_deviation is None:
+            deviations = np.array([sensor.deviation for sensor in sensors])
+        else:
+            deviations = _of_size("sensor_deviation", sensor_deviation, self._sensors)
+        self._sensor_variance = np.maximum(deviations, EXACT * self._sizes_of_outputs()) ** 2
+        self._check_observability()
+        self.reset()
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario) -> Self:
+        """The filter of a scenario with sensors.
+
+        Args:
+            scenario: Has the tables `[[sensor]]` and `[estimator]`.
+        """
+        table = scenario.estimator or EstimatorTable()
+        return cls(
+            Problem.from_scenario(scenario),
+            scenario.sensors or (),
+            disturbance_deviation=table.disturbance_deviation,
+            sensor_deviation=table.sensor_deviation,
+            parameter_drift=table.parameter_drift,
+        )
+
+    def reset(self) -> None:
+        """Forget every reading: the reference, and the initial deviation about it."""
+        n = self._n
+        # The present z and, behind it, those of earlier samples.
+        self._states = np.tile(self._reference, (self._longest + 1, 1))
+        self._covariance = np.zeros((self._states.size, self._states.size))
+        self._covariance[:n, :n] = np.diag(self._initial_deviation**2)
+
+    @property
+    def estimate(self) -> Vector:
+        """Of the present state, (n,)."""
+        return self._states[0, : self._problem.n_states].copy()
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Estimates of the model's uncertain parameters, by name."""
+        names = self._problem.model.uncertain if self._uncertain else ()
+        values = self._states[0, self._problem.n_states :].tolist()
+        return dict(zip(names, values, strict=True))
+
+    @property
+    def covariance(self) -> Matrix:
+        """Of the present estimate's error, (n, n)."""
+        n = self._problem.n_states
+        return self._covariance[:n, :n].copy()
+
+    def state_dict(self) -> dict[str, Vector]:
+        """All that the filter remembers."""
+        return {"states": self._states.copy(), "covariance": self._covariance.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Vector]) -> None:
+        """Restore what `state_dict` returned."""
+        self._states = state["states"].copy()
+        self._covariance = state["covariance"].copy()
+
+    def predict(self, a: ArrayLike) -> None:
+        """Go on by a sample.
+
+        Args:
+            a: Action that was applied, (m,).
+        """
+        n = self._n
+        step = self._transition
+        step.inputs["z"][:] = self._states[0]
+        step.inputs["u"][:] = a
+        step()
+        A = step.matrix("A").T
+        G = step.matrix("G").T
+        # Every state moves back by one sample, the oldest is forgotten.
+        kept = self._covariance[: self._covariance.shape[0] - n, : self._covariance.shape[0] - n]
+        across = A @ self._covariance[:n]
+        moved = np.empty_like(self._covariance)
+        noise = (G * self._disturbance_variance) @ G.T + self._drift_variance
+        moved[:n, :n] = across[:, :n] @ A.T + noise
+        if self._longest:
+            moved[n:, n:] = kept
+            moved[:n, n:] = across[:, : len(kept)]
+            moved[n:, :n] = moved[:n, n:].T
+            self._states[1:] = self._states[:-1].copy()
+        self._states[0] = step.part("z_next")
+        self._covariance = moved
+
+    def correct(self, y: ArrayLike) -> Vector:
+        """Take up the readings of a sample.
+
+        Args:
+            y: Readings, (n_y,), NaN where there is none.
+
+        Returns:
+            The estimate, (n,).
+
+        Raises:
+            ControllerError: y has another shape or is infinite.
+        """
+        readings = np.asarray(y, dtype=np.float64)
+        if readings.shape != self._delays.shape or np.isinf(readings).any():
+            raise ControllerError(
+                f"y must be {self._delays.size} readings, NaN where there is none, not {readings}"
+            )
+        arrived = np.flatnonzero(~np.isnan(readings))
+        # One after the other: their noises are independent, so that nothing is inverted.
+        for i in arrived.tolist():
+            self._correct_by(i, float(readings[i]))
+        return self.estimate
+
+    def _correct_by(self, i: int, reading: float) -> None:
+        """Take up the reading of sensor i."""
+        n = self._n
+        delay = int(self._delays[i])
+        output = self._output
+        output.inputs["z"][:] = self._states[delay]
+        output()
+        slope = output.matrix("C").T[i]
+        first = delay * n
+        # Covariance of the error with the predicted reading, and the variance of the latter.
+        across = self._covariance[:, first : first + n] @ slope
+        variance = slope @ across[first : first + n] + self._sensor_variance[i]
+        gain = across / variance
+        innovation = reading - output.part("y")[i]
+        self._states += (gain * innovation).reshape(self._states.shape)
+        # Symmetric by its form; the sensor's variance keeps it positive semidefinite.
+        self._covariance -= np.outer(gain, across)
+
+    def _sizes_of_outputs(self) -> Vector:
+        """Size of each sensor's variable over the bounds' widths about the reference, (n_y,)."""
+        self._output.inputs["z"][:] = self._reference
+        self._output()
+        n_states = self._problem.n_states
+        sensitivity = np.abs(self._output.matrix("C").T[:, :n_states])
+        sizes: Vector = sensitivity @ _widths(self._problem)
+        return sizes
+
+    def _check_observability(self) -> None:
+        """Raise ControllerError where a direction of the state is neither seen nor decays."""
+        problem = self._problem
+        step = self._transition
+        n = problem.n_states
+        step.inputs["z"][:] = self._reference
+        step.inputs["u"][:] = problem.reference_action
+        step()
+        A = step.matrix("A").T[:n, :n]
+        C = self._output.matrix("C").T[:, :n]
+        values, vectors = np.linalg.eig(A)
+        names = [quantity.name for quantity in problem.model.states]
+        for value, direction in zip(values, vectors.T, strict=True):
+            # Popov, Belevitch and Hautus: a mode is observed where C v is not zero.
+            seen = np.abs(C @ direction).max() > UNSEEN * np.abs(C).max()
+            if seen or abs(value) < 1.0:
+                continue
+            largest = int(np.argmax(np.abs(direction)))
+            parts = []
+            for name, part in zip(names, (direction / direction[largest]).real, strict=True):
+                if abs(part) > UNSEEN:
+                    parts.append(f"{part:+.3g} {name}")
+            raise ControllerError(
+                f"the sensors do not show the direction {' '.join(parts)} of the state of model "
+                f"'{problem.model.name}', which does not decay by itself: no estimator can know "
+                "it; add a [[sensor]] that depends on it"
+            )
+
+
+class OutputFeedback:
+    """A controller that is given measurements: an estimator, then a controller of the state.
+
+    `prepare` predicts the state under the action that was applied, and lets the controller prepare;
+    `feedback(y)` corrects the estimate, and feeds it back. Any other attribute is the controller's.
+
+    Args:
+        estimator: Estimates the state.
+        controller: Takes the estimate for the state.
+    """
+
+    given = "measurement"
+
+    def __init__(self, estimator: Estimator, controller: Controller) -> None:
+        self.estimator = estimator
+        self.controller = controller
+        self._last_action: Vector | None = None
+        self._is_predicted = True
+        self._is_corrected = False
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario, controller: Controller) -> OutputFeedback:
+        """Put the scenario's estimator before a controller.
+
+        Args:
+            scenario: Has the tables `[[sensor]]` and `[estimator]`.
+            controller: Takes the state.
+
+        Raises:
+            ControllerError: The scenario wants no estimator, or its factory makes none.
+        """
+        kind = scenario.estimator.kind if scenario.estimator is not None else "ekf"
+        if kind == "ekf":
+            return cls(ExtendedKalmanFilter.from_scenario(scenario), controller)
+        if kind == "none":
+            raise ControllerError("estimator.kind is 'none': there is no estimator to put before")
+        factory = load_plugin(kind, "estimator.kind", ControllerError)
+        estimator = factory(scenario)
+        if not all(hasattr(estimator, name) for name in ESTIMATOR_METHODS):
+            raise ControllerError(
+                f"estimator.kind '{kind}' made a {type(estimator).__name__}, which lacks "
+                f"one of {', '.join(ESTIMATOR_METHODS)}"
+            )
+        return cls(estimator, controller)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("controller", "compiled_loop"):
+            # The first while a copy is made; a compiled loop knows of no estimator.
+            raise AttributeError(name)
+        return getattr(self.controller, name)
+
+    @property
+    def theta(self) -> Vector:
+        """θ of the controller, (n_θ,)."""
+        theta: Vector = self.controller.theta  # type: ignore[attr-defined]
+        return theta
+
+    @theta.setter
+    def theta(self, theta: Vector) -> None:
+        self.controller.theta = theta  # type: ignore[attr-defined]
+
+    @property
+    def estimate(self) -> Vector:
+        """Of the present state, (n,)."""
+        return self.estimator.estimate.copy()
+
+    def reset(self) -> None:
+        """Forget every earlier sample."""
+        self.estimator.reset()
+        self.controller.reset()
+        self._last_action = None
+        self._is_predicted = True
+        self._is_corrected = False
+
+    def state_dict(self) -> dict[str, Vector]:
+        """What the estimator remembers, after a `feedback`; the controller keeps its own."""
+        return self.estimator.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Vector]) -> None:
+        """Restore what `state_dict` returned: the present sample's readings are in it."""
+        self.estimator.load_state_dict(state)
+        self._is_corrected = True
+
+    def resume(self) -> None:
+        """Reset the controller and keep the estimate: what follows a failed solve."""
+        self.controller.reset()
+
+    def prepare(self) -> None:
+        """Predict the state, and do the controller's work that needs no measurement."""
+        if not self._is_predicted and self._last_action is not None:
+            self.estimator.predict(self._last_action)
+        self._is_predicted = True
+        self._is_corrected = False
+        self.controller.prepare()
+
+    def feedback(self, y: ArrayLike, a: Vector | None = None) -> Solution:
+        """Correct the estimate by the sample's readings, and solve for it.
+
+        Args:
+            y: Readings, (n_y,), NaN where nothing new came. A second call in a sample, with `a`,
+                leaves the estimate as it is.
+            a: Action to which the first one is fixed, (m,); without it the controller chooses.
+        """
+        if not self._is_corrected:
+            self.estimator.correct(np.asarray(y, dtype=np.float64))
+            self._is_corrected = True
+        solution = self.controller.feedback(self.estimator.estimate.copy(), a)
+        self.applied(solution.action if a is None else a)
+        return solution
+
+    def applied(self, a: Vector) -> None:
+        """Say which action (m,) was applied, where it is not the solution's own."""
+        self._last_action = a
+        self._is_predicted = False
+
+
+def measured(scenario: Scenario, controller: Controller) -> Controller:
+    """The controller behind the scenario's estimator; itself where it needs none.
+
+    Args:
+        scenario: Has sensors, or none.
+        controller: Takes the state, or what the sensors show.
+    """
+    table = scenario.estimator or EstimatorTable()
+    takes_state = getattr(controller, "given", "state") == "state"
+    if not scenario.sensors or table.kind == "none" or not takes_state:
+        return controller
+    return OutputFeedback.from_scenario(scenario, controller)
+
+
+def _of_size(name: str, values: ArrayLike, counted: Sequence[object]) -> Vector:
+    """Values as an array; raises ModelError where they are not one for each of what is counted."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (len(counted),):
+        raise ModelError(f"estimator.{name} must have {len(counted)} entries, not {array.size}")
+    return array
+
+
+def _widths(problem: Problem) -> Vector:
+    """Widths of the states' bounds, (n,); where there is no bound the reference's size."""
+    widths = problem.state_upper - problem.state_lower
+    return np.where(np.isfinite(widths), widths, np.abs(problem.reference_state))
+
+
+def _with_uncertain(problem: Problem, uncertain: Sequence[int]) -> tuple[ca.SX, ca.SX]:
+    """Symbols z of states and uncertain parameters, and p with these in their places."""
+    model = problem.model
+    z = ca.SX.sym("z", problem.n_states + len(uncertain))
+    p = ca.SX(ca.DM(model.nominal_parameters))
+    for place, index in enumerate(uncertain):
+        p[index] = z[problem.n_states + place]
+    return z, p
+
+
+def _transition(problem: Problem, uncertain: Sequence[int]) -> StackedFunction:
+    """z₊, A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u)."""
+    model = problem.model
+    f = discretise(model, problem.sampling_time, problem.substeps)
+    z, p = _with_uncertain(problem, uncertain)
+    _, u, d, _ = model.symbols()
+    x_next: Any = f(z[: problem.n_states], u, d, p)
+    z_next = ca.vertcat(x_next, z[problem.n_states :])
+    derivatives: Any = ca.Function(
+        "derivatives", [z, u, d], [z_next, ca.jacobian(z_next, z), ca.jacobian(z_next, d)]
+    )
+    value, A, G = derivatives(z, u, ca.SX(ca.DM(model.nominal_disturbance)))
+    return StackedFunction(
+        "estimator_transition", {"z": z, "u": u}, {"z_next": value, "A": A, "G": G}
+    )
+
+
+def measured_outputs(
+    problem: Problem, sensors: Sequence[SensorTable], uncertain: Sequence[int] = ()
+) -> StackedFunction:
+    """What sensors read of the model: `y` (n_y,) and C = ∂y/∂z, by z.
+
+    Args:
+        problem: Has the model.
+        sensors: Name the states and outputs of the model.
+        uncertain: Places of the parameters that z has behind the states; the others are nominal.
+
+    Raises:
+        ModelError: A sensor reads what is neither a state nor an output.
+    """
+    model = problem.model
+    z, p = _with_uncertain(problem, uncertain)
+    x = z[: problem.n_states]
+    _, u, d, _ = model.symbols()
+    names = [quantity.name for quantity in model.states]
+    rows = []
+    for variable in (sensor.variable for sensor in sensors):
+        if variable in model.outputs:
+            rows.append(model.outputs[variable](x, u, d, p))
+        elif variable in names:
+            rows.append(x[names.index(variable)])
+        else:
+            raise ModelError(
+                f"a [[sensor]] reads '{variable}', which is neither a state nor an output of model "
+                f"'{model.name}': give it to the model, Model(outputs={{'{variable}': …}})"
+            )
+    y = ca.vertcat(*rows)
+    return StackedFunction("estimator_output", {"z": z}, {"y": y, "C": ca.jacobian(y, z)})

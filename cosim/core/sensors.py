@@ -1,0 +1,116 @@
+"""Sensors: what is measured of a plant at each sample, with noise, seldom and late."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from math import nan
+
+import numpy as np
+
+from cosim.core.errors import PlantError
+from cosim.core.protocols import Array
+from cosim.core.scenario import SensorTable
+
+BLOCK = 256
+"""Draws of a sensor that are made at once."""
+_SEED = struct.Struct("<Q")
+STREAM = 0x53454E53
+"""Word of the counter that keeps the sensors' draws apart from every other use of a seed."""
+
+
+class Sensors:
+    """The readings of a plant's sensors.
+
+    A sensor takes a reading at the samples 0, `every`, 2·`every`, …: its variable's value then,
+    plus normal noise. The reading arrives `delay` samples later; at samples where none arrives
+    there is NaN. The noise of sensor i at sample k is a function of (seed, i, k) alone, as the
+    FMU's disturbances are, so that every controller meets the same.
+
+    Args:
+        tables: the sensors, n_y of them.
+    """
+
+    def __init__(self, tables: Sequence[SensorTable]) -> None:
+        self.variables = tuple(table.variable for table in tables)
+        self._tables = tuple(tables)
+        self._memory = max(table.delay for table in tables) + 1
+        self._seed = 0
+        self._past: Array = np.full((self._memory, len(tables)), nan)
+        self._blocks: dict[int, tuple[int, Array]] = {}
+
+    def start(self, seed: int, values: Sequence[float]) -> Array:
+        """Begin an episode.
+
+        Args:
+            seed: of the noise, in [0, 2⁶⁴).
+            values: of the variables at k = 0, (n_y,).
+
+        Returns:
+            y_0, (n_y,).
+        """
+        self._seed = seed
+        self._blocks = {}
+        self._past = np.full_like(self._past, nan)
+        return self.read(0, values)
+
+    def read(self, k: int, values: Sequence[float]) -> Array:
+        """Take the readings of sample k, the one after the last.
+
+        Args:
+            k: number of the sample since the start.
+            values: of the variables at that sample, (n_y,).
+
+        Returns:
+            y_k, (n_y,), what arrives at sample k; NaN where nothing does.
+        """
+        # A ring of the last values: sample j is in row j mod memory.
+        self._past[k % self._memory] = values
+        y = np.full(len(self._tables), nan)
+        for i, table in enumerate(self._tables):
+            taken = k - table.delay
+            if taken < 0 or taken % table.every != 0:
+                continue
+            y[i] = self._past[taken % self._memory, i]
+            if table.deviation > 0.0:
+                y[i] += table.deviation * self._noise(i, taken)
+        return y
+
+    def _noise(self, i: int, k: int) -> float:
+        """The standard normal draw of sensor i at sample k."""
+        block = k // BLOCK
+        number, draws = self._blocks.get(i, (-1, np.empty(0)))
+        if number != block:
+            # As integers of 64 bits: in a list NumPy would round a large seed.
+            key = np.array([self._seed, STREAM], dtype=np.uint64)
+            counter = np.array([0, 0, block, i], dtype=np.uint64)
+            generator = np.random.Philox(key=key, counter=counter)
+            draws = np.random.Generator(generator).standard_normal(BLOCK)
+            self._blocks[i] = block, draws
+        return float(draws[k % BLOCK])
+
+    def state(self) -> tuple[int, Array]:
+        """What `restore` needs to go on from here: the seed, and a copy of the last values."""
+        return self._seed, self._past.copy()
+
+    def restore(self, state: tuple[int, Array]) -> None:
+        """Go back to a `state`."""
+        seed, past = state
+        if seed != self._seed:
+            self._blocks = {}
+        self._seed = seed
+        self._past = past.copy()
+
+    def to_bytes(self, state: tuple[int, Array]) -> bytes:
+        """A `state` as bytes, for any process."""
+        seed, past = state
+        return _SEED.pack(seed) + past.tobytes()
+
+    def from_bytes(self, data: bytes) -> tuple[tuple[int, Array], bytes]:
+        """A `state` from the begin of some bytes, and the rest of these; raises PlantError."""
+        end = _SEED.size + self._past.nbytes
+        if len(data) < end:
+            raise PlantError("these bytes are not the plant state of a scenario with these sensors")
+        (seed,) = _SEED.unpack_from(data)
+        past = np.frombuffer(data[_SEED.size : end]).reshape(self._past.shape).copy()
+        return (seed, past), data[end:]

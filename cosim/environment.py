@@ -33,7 +33,9 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     """A scenario's plant: observation x_k (n,), action u_k (m,) in physical units, endless.
 
     The reward is −(ℓ(x_k, u_k, d_k) + penalty(x_k)), so that J is minus its mean. Actions are
-    saturated to the scenario's bounds, as actuators do. `reset(seed=K)` starts the episode that
+    saturated to the scenario's bounds, as actuators do. Where the scenario has sensors the
+    observation is not x_k but (2·n_y,): of each sensor the last reading and its age in samples; 0
+    and −1 before the first one arrives. `reset(seed=K)` starts the episode that
     `cosim simulate --seed K` runs; a later `reset()` draws a new one. `info` holds `stage_cost`,
     `penalty` and `disturbance` (p,) of the step.
     """
@@ -50,6 +52,13 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         self._plant = FmuPlant(scenario)
         # The FMU's own ranges of its states.
         low, high = self._plant.state_range
+        sensors = self.scenario.sensors or ()
+        if sensors:
+            low = np.concatenate([np.full(len(sensors), -np.inf), np.full(len(sensors), -1.0)])
+            high = np.full(2 * len(sensors), np.inf)
+        self._delays: Array = np.array([sensor.delay for sensor in sensors], dtype=float)
+        self._last_readings: Array = np.zeros(len(sensors))
+        self._ages: Array = np.full(len(sensors), -1.0)
         self.observation_space = Box(low, high, dtype=np.float64)
         # Gymnasium may write to its arrays, a scenario's are read-only.
         lower = self.scenario.action_lower.copy()
@@ -73,7 +82,7 @@ class PlantEnv(gymnasium.Env[Array, Array]):
             options: `{"initial_state": x}` starts the episode from x (n,).
 
         Returns:
-            The state, (n,), and an empty dictionary.
+            The observation, and an empty dictionary.
         """
         super().reset(seed=seed)
         unknown = set(options or ()) - {"initial_state"}
@@ -89,7 +98,19 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         self._states.clear()
         self._actions.clear()
         self._states.append(s)
-        return s, {}
+        self._last_readings = np.zeros_like(self._last_readings)
+        self._ages = np.full_like(self._ages, -1.0)
+        return self._observation(s, self._plant.y), {}
+
+    def _observation(self, s: Array, y: Array | None) -> Array:
+        """The state (n,); under sensors the last readings and their ages, (2·n_y,)."""
+        if y is None:
+            return s
+        arrived = ~np.isnan(y)
+        older = np.where(self._ages >= 0.0, self._ages + 1.0, -1.0)
+        self._ages = np.where(arrived, self._delays, older)
+        self._last_readings = np.where(arrived, y, self._last_readings)
+        return np.concatenate([self._last_readings, self._ages])
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Hold an action (m,) for one sample; never terminates (a TimeLimit truncates).
@@ -101,11 +122,11 @@ class PlantEnv(gymnasium.Env[Array, Array]):
                 f"an action has shape {self.action_space.shape}, not {np.shape(action)}"
             )
         applied = self.scenario.saturate(action)
-        s, stage_cost, penalty, disturbance, _ = self._plant.step(applied)
+        s, stage_cost, penalty, disturbance, y = self._plant.step(applied)
         info = {"stage_cost": stage_cost, "penalty": penalty, "disturbance": disturbance}
         self._states.append(s)
         self._actions.append(applied)
-        return s, -(stage_cost + penalty), False, False, info
+        return self._observation(s, y), -(stage_cost + penalty), False, False, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the last samples as an RGB image (height, width, 3); None without a render mode."""
@@ -142,6 +163,11 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         env: Any = PlantEnv(scenario, render_mode=render_mode)
         super().__init__(env)
         task: Scenario = env.scenario
+        if task.sensors:
+            raise PlantError(
+                f"scenario '{task.name}' has sensors, for whose readings there are no normalised "
+                "units: use PlantEnv"
+            )
         self._scenario = task
         width = task.state_upper - task.state_lower
         magnitude = np.abs(task.reference_state)

@@ -117,3 +117,20 @@ def test_a_step_is_the_plants_own_in_other_units(normalised_env, paper, normalis
     point, cost = paper.reference_state, paper.controller.reference_cost
     np.testing.assert_allclose(seen, 10 * (s / point - 1), rtol=1e-5, atol=1e-6)
     assert scaled == pytest.approx(10 * (1 + reward / cost), rel=1e-12)
+
+
+def test_under_sensors_it_shows_the_last_readings_and_their_ages():
+    env = PlantEnv("late")
+    rows = [env.reset(seed=4)[0]]
+    for _ in range(32):
+        rows.append(env.step(env.scenario.reference_action)[0])
+    readings = np.array(rows)
+    assert env.observation_space.contains(readings[-1])
+    # X2 is taken at 0, 15, 30, … and comes 15 samples later; P2 comes at once.
+    ages = [-1.0] * 15 + [15.0 + (k - 15) % 15 for k in range(15, 33)]
+    assert readings[:, 2].tolist() == ages
+    assert (readings[:15, 0] == 0.0).all()
+    assert len(set(readings[15:30, 0])) == 1
+    assert (readings[:, 3] == 0.0).all()
+    with pytest.raises(PlantError, match="no normalised units"):
+        NormalisedEnv("late")

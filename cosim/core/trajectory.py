@@ -21,7 +21,7 @@ from cosim.core.scenario import VIOLATING, Scenario
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Group = Literal["states", "actions", "disturbances", "costs", "step_time", "unseen"]
+Group = Literal["states", "actions", "disturbances", "sensors", "costs", "step_time", "unseen"]
 COST = "unit of the stage cost"
 Derived = Callable[[Scenario, Mapping[str, Array]], Array]
 """K values of a signal, (K,), from a scenario and K values of each signal declared before it."""
@@ -84,8 +84,8 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("states", group="states", vector="plant.states"),
     SignalKind("actions", group="actions", vector="plant.actions"),
     SignalKind("disturbances", group="disturbances", vector="plant.disturbances"),
-    SignalKind("measurements", group="states", vector="measurement_names"),
-    SignalKind("estimates", group="states", vector="estimate_names"),
+    SignalKind("measurements", group="sensors", vector="measurement_names"),
+    SignalKind("estimates", group="sensors", vector="estimate_names"),
     SignalKind("stage_cost", unit=COST, group="costs"),
     SignalKind("penalty", _penalty, COST, "costs"),
     SignalKind("violation", _violation),

@@ -98,10 +98,29 @@ def _loop_panels(
         _line(axes, time, trajectory, name, color, width=0.9, shade=BOUND)
         _limits(axes, *scenario.limits[name])
         axes.axhline(reference, color=REFERENCE, linewidth=0.7)
+        _draw_known(axes, time, trajectory, name)
         if name in scenario.plant.actions and failed.any():
             values = trajectory[name][failed]
             axes.plot(time[failed], values, "x", color=BOUND, ms=4, label="fallback")
             axes.legend(loc="upper right")
+
+
+def _draw_known(axes: Axes, time: Array, trajectory: DrawnRun, name: str) -> None:
+    """Draw what sensors showed of a state, and its estimate, where there are any."""
+    signals = trajectory.signals
+    measured = f"measured[{name}]"
+    estimated = f"estimated[{name}]"
+    if estimated in signals:
+        values = signals[estimated].values
+        axes.plot(time, values, color=INK, linewidth=0.6, linestyle=DASHED, label="estimated")
+    if measured in signals:
+        values = signals[measured].values
+        axes.plot(time, values, ".", color=INK, markersize=2.5, label="measured")
+    if estimated in signals or measured in signals:
+        # Above the panel, where no line runs.
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=6.0, borderaxespad=0.2
+        )
 
 
 def _draw_mean(axes: Axes, mean: float) -> None:

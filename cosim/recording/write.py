@@ -44,7 +44,7 @@ _ABANDONED: list[rr.RecordingStream] = []
 AT = rr.TimeRangeBoundary.absolute
 Range = tuple[float, float]
 
-ALONE = ("states", "actions", "costs")
+ALONE = ("states", "actions", "sensors", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
 HELD = ("actions", "disturbances")
 FREE = (-inf, inf)
@@ -221,8 +221,12 @@ class RerunRecorder:
         along = axis(AT(seconds=0.0), AT(seconds=self._seconds))
         loop = []
         for channel in self._group("states", "actions"):
-            within = [fine for fine in self._fine if fine.name == channel.name and fine.window()]
-            loop.append(view(channel.title, [channel, *within], along))
+            shown = [channel]
+            shown += [fine for fine in self._fine if fine.name == channel.name and fine.window()]
+            # What is measured and estimated of a state is drawn over it.
+            known = (f"measured[{channel.name}]", f"estimated[{channel.name}]")
+            shown += [sensor for sensor in self._group("sensors") if sensor.name in known]
+            loop.append(view(channel.title, shown, along))
         causes: list[rrb.View] = []
         for channel in self._group("costs"):
             causes.append(view(channel.title, [channel], along))
@@ -247,7 +251,9 @@ class RerunRecorder:
 
 def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:
     """The signals of a kind as they are drawn; a unit not known is left empty."""
-    colors = cycle(SERIES[2:] if kind.name == "actions" else SERIES)
+    # What is drawn into one view has unlike colours.
+    first_color = {"actions": 2, "measurements": 2, "estimates": 4}.get(kind.name, 0)
+    colors = cycle(SERIES[first_color:])
     channels = []
     for name, unit in kind.units(scenario, units).items():
         alone = kind.group in ALONE

@@ -39,53 +39,75 @@ class AxisInterpolant:
     """
 
     def __init__(self, axis: Array, smooth: tuple[float, float] | None) -> None:
-        cells = np.arange(len(axis) - 1)
-        if smooth is None:
-            cubic = np.zeros(len(cells), dtype=bool)
-        else:
-            tolerance = 1e-9 * (axis[-1] - axis[0])
-            cubic = axis[:-1] >= smooth[0] - tolerance
-            cubic &= axis[1:] <= smooth[1] + tolerance
+        n_points = len(axis)
+        n_cells = n_points - 1
+        cubic = _cells_within(axis, smooth)
         any_cubic = cubic.sum() >= CUBIC_POINTS - 1
-        count = CUBIC_POINTS if any_cubic else 2
+        stencil_size = CUBIC_POINTS if any_cubic else 2
 
         # The stencil is about the cell, but within the axis, and a cubic's within the smooth part.
-        first = np.clip(cells - (count // 2 - 1), 0, len(axis) - count)
+        centred = np.arange(n_cells) - (stencil_size // 2 - 1)
+        first = np.clip(centred, 0, n_points - stencil_size)
         if any_cubic:
-            within = np.flatnonzero(cubic)
-            first[cubic] = np.clip(first[cubic], within[0], within[-1] + 2 - CUBIC_POINTS)
+            cubic_cells = np.flatnonzero(cubic)
+            last_first = cubic_cells[-1] + 2 - CUBIC_POINTS
+            first[cubic] = np.clip(first[cubic], cubic_cells[0], last_first)
 
-        weights = np.zeros((count, count, len(cells)))
-        for c in cells:
+        weights = np.zeros((stencil_size, stencil_size, n_cells))
+        for c in range(n_cells):
+            points = range(c, c + 2)
             if any_cubic and cubic[c]:
                 points = range(first[c], first[c] + CUBIC_POINTS)
-            else:
-                points = range(c, c + 2)
             for j in points:
                 polynomial = _lagrange_polynomial(axis, j, points, axis[c])
-                weights[: len(polynomial), j - first[c], c] = polynomial
+                n_powers = len(polynomial)
+                weights[:n_powers, j - first[c], c] = polynomial
+
         self.axis = axis
         self.first = first
         self.weights = weights
 
     def locate(self, x: Array) -> tuple[Indices, Array]:
         """Cells of coordinates and offsets in them; outside the axis, those of its ends."""
-        inside = np.clip(x, self.axis[0], self.axis[-1])
-        cell = np.searchsorted(self.axis[1:-1], inside, side="right")
-        return cell, inside - self.axis[cell]
+        lowest = self.axis[0]
+        highest = self.axis[-1]
+        inside = np.clip(x, lowest, highest)
+        inner_points = self.axis[1:-1]
+        cell = np.searchsorted(inner_points, inside, side="right")
+        offset = inside - self.axis[cell]
+        return cell, offset
 
 
-def _lagrange_polynomial(axis: Array, j: int, points: Sequence[int], origin: float) -> Array:
+def _cells_within(axis: Array, interval: tuple[float, float] | None) -> NDArray[np.bool_]:
+    """Which cells of an axis lie in an interval, up to rounding; none where it is None."""
+    if interval is None:
+        return np.zeros(len(axis) - 1, dtype=bool)
+    lower, upper = interval
+    tolerance = 1e-9 * (axis[-1] - axis[0])
+    begins_within = axis[:-1] >= lower - tolerance
+    ends_within = axis[1:] <= upper + tolerance
+    return np.asarray(begins_within & ends_within)
+
+
+def _lagrange_polynomial(
+    axis: Array,
+    j: int,
+    points: Sequence[int],
+    origin: float,
+) -> Array:
     """Coefficients, in powers of x − origin, of the polynomial that is 1 at axis[j], 0 at others.
 
     The others are the points of the axis with the indices `points`.
     """
     polynomial = np.ones(1)
     for k in points:
-        if k != j:
-            width = axis[j] - axis[k]
-            factor = [(origin - axis[k]) / width, 1 / width]
-            polynomial = np.convolve(polynomial, factor)
+        if k == j:
+            continue
+        # The factor (x − axis[k]) / (axis[j] − axis[k]).
+        width = axis[j] - axis[k]
+        constant = (origin - axis[k]) / width
+        slope = 1 / width
+        polynomial = np.convolve(polynomial, [constant, slope])
     return polynomial
 
 
@@ -115,48 +137,65 @@ class Grid:
     def points(self) -> Array:
         """Grid states, shape (G, n), the last state running fastest."""
         mesh = np.meshgrid(*self.axes, indexing="ij")
-        return np.stack([axis.reshape(-1) for axis in mesh], axis=1)
+        columns = [coordinate.reshape(-1) for coordinate in mesh]
+        return np.stack(columns, axis=1)
 
     def nearest(self, state: Sequence[float] | Array) -> int:
         """Index of the grid state nearest to `state` in each coordinate."""
-        index = [int(np.abs(axis - x).argmin()) for axis, x in zip(self.axes, state, strict=True)]
+        index = []
+        for axis, x in zip(self.axes, state, strict=True):
+            distance = np.abs(axis - x)
+            index.append(int(distance.argmin()))
         return int(np.ravel_multi_index(index, self.shape))
 
     def weights(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
         """Grid indices and weights of interpolation at states given as one array per entry."""
-        corners: list[tuple[Indices, Array]] = [(np.zeros((), dtype=np.intp), np.ones(()))]
-        for interpolant, axis, values in zip(self._interpolants, self.axes, x, strict=True):
+        # The empty product: one corner, at index 0, of weight 1.
+        origin: Indices = np.zeros((), dtype=np.intp)
+        corners: list[tuple[Indices, Array]] = [(origin, np.ones(()))]
+        for interpolant, values in zip(self._interpolants, x, strict=True):
+            n_points = len(interpolant.axis)
             cell, offset = interpolant.locate(values)
             first = interpolant.first[cell]
-            # Each corner so far has one successor for each point of this axis' stencil.
             stencil = []
             for j in range(interpolant.weights.shape[1]):
                 factor = _horner(interpolant.weights[:, j], cell, [offset])
                 stencil.append((first + j, factor))
+            # Each corner so far has one successor for each point of this axis' stencil.
             extended = []
             for index, weight in corners:
                 for position, factor in stencil:
-                    extended.append((index * len(axis) + position, weight * factor))
+                    index_here = index * n_points + position
+                    weight_here = weight * factor
+                    extended.append((index_here, weight_here))
             corners = extended
         return corners
 
     def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
         """Function that interpolates `values` (G,) at states given as one array per entry."""
+        # Coefficients of the polynomial of each cell: one axis after the other.
         table = values.reshape(self.shape)
         for interpolant in self._interpolants:
-            stencil = interpolant.first + np.arange(interpolant.weights.shape[1])[:, None]
+            stencil_size = interpolant.weights.shape[1]
+            stencil = interpolant.first + np.arange(stencil_size)[:, None]
             # The first axis becomes (power, cell), and both go last.
             table = np.einsum("ijc,jc...->...ic", interpolant.weights, table[stencil])
+
+        # Powers first, as `_horner` reads them; the cells behind them become one axis.
         n = len(self.axes)
-        table = table.transpose(*range(0, 2 * n, 2), *range(1, 2 * n, 2))
-        table = np.ascontiguousarray(table.reshape(*table.shape[:n], -1))
+        powers = range(0, 2 * n, 2)
+        cells = range(1, 2 * n, 2)
+        table = table.transpose(*powers, *cells)
+        n_powers = table.shape[:n]
+        table = np.ascontiguousarray(table.reshape(*n_powers, -1))
 
         def function(x: Sequence[Array]) -> Array:
             index: Indices = np.zeros((), dtype=np.intp)
             offsets = []
             for interpolant, entry in zip(self._interpolants, x, strict=True):
                 cell, offset = interpolant.locate(entry)
-                index = index * (len(interpolant.axis) - 1) + cell
+                n_cells = len(interpolant.axis) - 1
+                index = index * n_cells + cell
                 offsets.append(offset)
             return _horner(table, index, offsets)
 
@@ -165,7 +204,10 @@ class Grid:
     @cached_property
     def _interpolants(self) -> list[AxisInterpolant]:
         smooth = self.smooth or (None,) * len(self.axes)
-        return [AxisInterpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
+        interpolants = []
+        for axis, interval in zip(self.axes, smooth, strict=True):
+            interpolants.append(AxisInterpolant(axis, interval))
+        return interpolants
 
 
 def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
@@ -183,7 +225,11 @@ Feature = tuple[float, float, float]
 """First and last point of an interval of an axis, and the width that its cells shall not exceed."""
 
 
-def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: float) -> Array:
+def graded_axis(
+    marks: Sequence[float],
+    features: Sequence[Feature],
+    growth: float,
+) -> Array:
     """Axis through all `marks`, dense at features, each cell outwards about `growth` times wider.
 
     The width of a cell at x is the least over the features of spacing + (growth − 1)·distance.
@@ -193,24 +239,42 @@ def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: flo
         features: Where the axis is dense.
         growth: Ratio of the widths of neighbouring cells, above 1.
     """
-    parts = []
-    for lower, upper in pairwise(marks):
-        fine = np.linspace(lower, upper, 4001)
-        middle = 0.5 * (fine[1:] + fine[:-1])
-        width = np.full(len(middle), upper - lower)
-        for first, last, spacing in features:
-            distance = np.maximum(np.maximum(first - middle, middle - last), 0.0)
-            np.minimum(width, spacing + (growth - 1.0) * distance, out=width)
-        # Number of cells from `lower` to each point; the axis has the points of whole numbers,
-        # after that count is rounded up to one.
-        count = np.append(0.0, np.cumsum(np.diff(fine) / width))
-        cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
-        inner = np.interp(np.arange(1, cells) * (count[-1] / cells), count, fine)
-        parts.append(np.concatenate([[lower], inner]))
-    return np.concatenate([*parts, [marks[-1]]])
+    pieces = [_graded_piece(lower, upper, features, growth) for lower, upper in pairwise(marks)]
+    end = np.array([marks[-1]])
+    return np.concatenate([*pieces, end])
 
 
-def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> tuple[list[Array], Array]:
+def _graded_piece(
+    lower: float,
+    upper: float,
+    features: Sequence[Feature],
+    growth: float,
+) -> Array:
+    """The points of `graded_axis` between two marks, the lower one included."""
+    # The wanted width of a cell, as a function of its place, on a fine partition.
+    fine = np.linspace(lower, upper, 4001)
+    middle = 0.5 * (fine[1:] + fine[:-1])
+    width = np.full(len(middle), upper - lower)
+    for first, last, spacing in features:
+        outside = np.maximum(first - middle, middle - last)
+        distance = np.maximum(outside, 0.0)
+        allowed = spacing + (growth - 1.0) * distance
+        np.minimum(width, allowed, out=width)
+
+    # Number of cells from `lower` to each point, the integral of 1/width. The axis has the points
+    # where it is a whole number, after the last count is rounded up to one.
+    increments = np.diff(fine) / width
+    count = np.append(0.0, np.cumsum(increments))
+    n_cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
+    whole = np.arange(1, n_cells) * (count[-1] / n_cells)
+    inner = np.interp(whole, count, fine)
+    return np.append(lower, inner)
+
+
+def gauss_rule(
+    law: DisturbanceLaw,
+    counts: tuple[int, ...],
+) -> tuple[list[Array], Array]:
     """Nodes of each disturbance, and the weights of their product, the last one's running fastest.
 
     Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one, one node for a disturbance
@@ -231,38 +295,55 @@ def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> tuple[list[Array
         else:
             x, w = np.polynomial.hermite_e.hermegauss(count)
         axes.append(nominal + spread * x)
-        weights = np.multiply.outer(weights, w / w.sum()).reshape(-1)
+        probabilities = w / w.sum()
+        weights = np.multiply.outer(weights, probabilities).reshape(-1)
     return axes, weights
 
 
 class Refinement:
     """Polynomial interpolation of a smooth function from one product of nodes to another."""
 
-    def __init__(self, coarse: Sequence[Array], fine: Sequence[Array]) -> None:
-        self._matrices = []
-        for x, t in zip(coarse, fine, strict=True):
-            # The Lagrange polynomials of the nodes x at the targets t.
-            matrix = np.ones((len(t), len(x)))
-            for j, k in itertools.permutations(range(len(x)), 2):
-                matrix[:, j] *= (t - x[k]) / (x[j] - x[k])
-            self._matrices.append(matrix)
+    def __init__(
+        self,
+        coarse: Sequence[Array],
+        fine: Sequence[Array],
+    ) -> None:
+        matrices = []
+        for nodes, targets in zip(coarse, fine, strict=True):
+            matrices.append(_lagrange_matrix(nodes, targets))
         # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
-        while len(self._matrices) > 1 and self._matrices[-1].shape[1] < 4:
-            last = self._matrices.pop()
-            self._matrices[-1] = np.kron(self._matrices[-1], last).astype(np.float64)
+        while len(matrices) > 1 and matrices[-1].shape[1] < 4:
+            last = matrices.pop()
+            joined = np.kron(matrices.pop(), last)
+            matrices.append(joined.astype(np.float64))
+        self._matrices = matrices
 
     def __call__(self, values: Array) -> Array:
         """Carry values (B, q_coarse) to (B, q_fine)."""
         count = len(values)
-        right = 1  # size of the axes that are fine already
+        n_fine = 1  # size of the axes that are fine already, the last ones
         for matrix in reversed(self._matrices):
             fine, coarse = matrix.shape
-            if right == 1:
+            if n_fine == 1:
                 values = values.reshape(count, -1, coarse) @ matrix.T
             else:
-                values = matrix @ values.reshape(-1, coarse, right)
-            right *= fine
+                values = matrix @ values.reshape(-1, coarse, n_fine)
+            n_fine *= fine
         return values.reshape(count, -1)
+
+
+def _lagrange_matrix(nodes: Array, targets: Array) -> Array:
+    """Values at the targets (t,) of the Lagrange polynomials of the nodes (q,), shape (t, q)."""
+    matrix = np.ones((len(targets), len(nodes)))
+    for j, k in itertools.permutations(range(len(nodes)), 2):
+        width = nodes[j] - nodes[k]
+        matrix[:, j] *= (targets - nodes[k]) / width
+    return matrix
+
+
+def _truth(condition: Any) -> Any:
+    """1 where a condition holds, else 0, as CasADi has its truth values."""
+    return np.where(condition, 1.0, 0.0)
 
 
 # NumPy's counterparts of CasADi's elementary operations, by their codes.
@@ -278,21 +359,48 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_INV: lambda a: 1.0 / a,
     ca.OP_POW: np.power,
     ca.OP_CONSTPOW: np.power,
-    ca.OP_LT: lambda a, b: np.where(a < b, 1.0, 0.0),
-    ca.OP_LE: lambda a, b: np.where(a <= b, 1.0, 0.0),
-    ca.OP_EQ: lambda a, b: np.where(a == b, 1.0, 0.0),
-    ca.OP_NE: lambda a, b: np.where(a != b, 1.0, 0.0),
-    ca.OP_NOT: lambda a: np.where(a == 0, 1.0, 0.0),
-    ca.OP_AND: lambda a, b: np.where((a != 0) & (b != 0), 1.0, 0.0),
-    ca.OP_OR: lambda a, b: np.where((a != 0) | (b != 0), 1.0, 0.0),
+    ca.OP_LT: lambda a, b: _truth(a < b),
+    ca.OP_LE: lambda a, b: _truth(a <= b),
+    ca.OP_EQ: lambda a, b: _truth(a == b),
+    ca.OP_NE: lambda a, b: _truth(a != b),
+    ca.OP_NOT: lambda a: _truth(a == 0),
+    ca.OP_AND: lambda a, b: _truth((a != 0) & (b != 0)),
+    ca.OP_OR: lambda a, b: _truth((a != 0) | (b != 0)),
     ca.OP_IF_ELSE_ZERO: lambda a, b: np.where(a != 0, b, 0.0),
+    ca.OP_EXP: np.exp,
+    ca.OP_LOG: np.log,
+    ca.OP_LOG1P: np.log1p,
+    ca.OP_EXPM1: np.expm1,
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_HYPOT: np.hypot,
+    ca.OP_SIGN: np.sign,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
+    ca.OP_SIN: np.sin,
+    ca.OP_COS: np.cos,
+    ca.OP_TAN: np.tan,
+    ca.OP_ASIN: np.arcsin,
+    ca.OP_ACOS: np.arccos,
+    ca.OP_ATAN: np.arctan,
+    ca.OP_ATAN2: np.arctan2,
+    ca.OP_SINH: np.sinh,
+    ca.OP_COSH: np.cosh,
+    ca.OP_TANH: np.tanh,
+    ca.OP_FABS: np.fabs,
+    ca.OP_FMIN: np.fmin,
+    ca.OP_FMAX: np.fmax,
 }
-for _name in (
-    *("exp", "log", "log1p", "expm1", "sqrt", "hypot", "sign", "floor", "ceil"),
-    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
-    *("fabs", "fmin", "fmax"),
-):
-    _OPERATIONS[getattr(ca, f"OP_{_name.upper()}")] = getattr(np, _name)
+
+
+class Instruction(NamedTuple):
+    """An instruction of a CasADi function: its code, and the places of its inputs and outputs.
+
+    The input of a constant is its value.
+    """
+
+    code: int
+    inputs: Sequence[Any]
+    outputs: Sequence[int]
 
 
 class Elementwise:
@@ -307,13 +415,14 @@ class Elementwise:
         self._n_work = function.sz_w()
         self._n_out = function.size1_out(0)
         self._out_rows = list(function.sparsity_out(0).row())
-        self._program: list[tuple[int, Sequence[Any], Sequence[int]]] = []
+        self._program: list[Instruction] = []
+        evaluated = (ca.OP_INPUT, ca.OP_OUTPUT, *_OPERATIONS)
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
             inputs: Sequence[Any] = function.instruction_input(k)
             if code == ca.OP_CONST:
                 inputs = [function.instruction_constant(k)]
-            elif code not in (ca.OP_INPUT, ca.OP_OUTPUT, *_OPERATIONS):
+            elif code not in evaluated:
                 what = f"operation {code} of CasADi"
                 if code == ca.OP_CALL:
                     what = "a call of a CasADi function, such as a table,"
@@ -321,28 +430,34 @@ class Elementwise:
                     f"function '{function.name()}': {what} cannot be evaluated over arrays; "
                     "write the model without it"
                 )
-            self._program.append((code, inputs, function.instruction_output(k)))
+            outputs = function.instruction_output(k)
+            self._program.append(Instruction(code, inputs, outputs))
 
     def __call__(self, *arguments: Any) -> list[Any]:
         """Evaluate; `arguments[i][j]` is entry j of argument i."""
         work: list[Any] = [0.0] * self._n_work
         result: list[Any] = [0.0] * self._n_out
-        for code, inputs, output in self._program:
+        for code, inputs, outputs in self._program:
             if code == ca.OP_CONST:
-                work[output[0]] = inputs[0]
+                work[outputs[0]] = inputs[0]
             elif code == ca.OP_INPUT:
-                work[output[0]] = arguments[inputs[0]][inputs[1]]
+                argument, entry = inputs
+                work[outputs[0]] = arguments[argument][entry]
             elif code == ca.OP_OUTPUT:
-                result[self._out_rows[output[1]]] = work[inputs[0]]
+                # An output's rows are those of its non-zeros.
+                row = self._out_rows[outputs[1]]
+                result[row] = work[inputs[0]]
             else:
-                work[output[0]] = _OPERATIONS[code](*[work[i] for i in inputs])
+                operation = _OPERATIONS[code]
+                operands = [work[place] for place in inputs]
+                work[outputs[0]] = operation(*operands)
         return result
 
 
 T = TypeVar("T")
-# Entries of an array (states × nodes) a task: fewer wait for the interpreter's lock, more do not
-# fit the cores' caches.
-_ENTRIES = 100_000
+ENTRIES_A_TASK = 100_000
+"""Entries of an array (states × nodes) a task: fewer wait for the interpreter's lock, more do not
+fit the cores' caches."""
 
 
 @dataclass(frozen=True)
@@ -359,11 +474,10 @@ class Accuracy:
 
     def draft(self) -> Accuracy:
         """A quarter of the work, for grids that only give a start."""
-        return Accuracy(
-            substeps=max(self.substeps // 2, 1),
-            nodes=tuple(min(count, 5) for count in self.nodes),
-            penalty_nodes=tuple(min(count, 10) for count in self.penalty_nodes),
-        )
+        substeps = max(self.substeps // 2, 1)
+        nodes = [min(count, 5) for count in self.nodes]
+        penalty_nodes = [min(count, 10) for count in self.penalty_nodes]
+        return Accuracy(substeps, tuple(nodes), tuple(penalty_nodes))
 
 
 class BellmanOperator:
@@ -373,21 +487,32 @@ class BellmanOperator:
     results do not depend on their number.
     """
 
-    def __init__(self, plant: PlantProblem, accuracy: Accuracy, *, workers: int = 1) -> None:
+    def __init__(
+        self,
+        plant: PlantProblem,
+        accuracy: Accuracy,
+        *,
+        workers: int = 1,
+    ) -> None:
         problem = plant.problem
+        model = problem.model
         law = plant.law
         self.problem = problem
         self.deterministic = law.kind == "none" or not law.ranges.any()
         self.accuracy = accuracy
-        step = discretise(problem.model, problem.sampling_time, accuracy.substeps)
-        self._step = Elementwise(step)
-        self._cost = Elementwise(economic_cost(problem.model))
+        self._step = Elementwise(discretise(model, problem.sampling_time, accuracy.substeps))
+        self._cost = Elementwise(economic_cost(model))
         self._parameters = plant.parameters
+
+        # The expectation is a sum over the product of each disturbance's nodes, (1, q) arrays.
         nodes, self._weights = gauss_rule(law, accuracy.nodes)
-        self._disturbance = [d.reshape(1, -1) for d in np.meshgrid(*nodes, indexing="ij")]
+        mesh = np.meshgrid(*nodes, indexing="ij")
+        self._disturbance = [values.reshape(1, -1) for values in mesh]
         penalty_nodes, self._penalty_weights = gauss_rule(law, accuracy.penalty_nodes)
         self._refine = Refinement(nodes, penalty_nodes)
-        self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
+        self._pool = None
+        if workers > 1:
+            self._pool = ThreadPoolExecutor(workers)
 
     def deviation(self, state: Array, action: Array) -> Array:
         """Standard deviation of the next state.
@@ -401,10 +526,19 @@ class BellmanOperator:
         """
         _, x_next = self._expected_cost(state[None, :], action[None, :])
         x = np.concatenate(x_next)
-        variance = (x * x) @ self._weights - (x @ self._weights) ** 2
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        mean = x @ self._weights
+        mean_square = (x * x) @ self._weights
+        # Rounding may leave the variance of a state that does not vary below zero.
+        variance = np.maximum(mean_square - mean**2, 0.0)
+        return np.asarray(np.sqrt(variance))
 
-    def values(self, states: Array, actions: Array, grid: Grid, W: Array) -> Array:
+    def values(
+        self,
+        states: Array,
+        actions: Array,
+        grid: Grid,
+        W: Array,
+    ) -> Array:
         """Q(s, a), shape (B,).
 
         Args:
@@ -417,11 +551,17 @@ class BellmanOperator:
 
         def values_of(part: slice) -> Array:
             cost, x_next = self._expected_cost(states[part], actions[part])
-            return cost + _mean(smooth(x_next), self._weights)
+            value_to_go = smooth(x_next)
+            return cost + _mean(value_to_go, self._weights)
 
-        return np.concatenate(list(self._map(values_of, len(states))))
+        parts = list(self._map(values_of, len(states)))
+        return np.concatenate(parts)
 
-    def chain(self, actions: Array, grid: Grid) -> tuple[sparse.csr_array, Array]:
+    def chain(
+        self,
+        actions: Array,
+        grid: Grid,
+    ) -> tuple[sparse.csr_array, Array]:
         """Markov chain of a policy on the grid.
 
         Args:
@@ -435,20 +575,30 @@ class BellmanOperator:
 
         def rows_of(part: slice) -> tuple[sparse.csr_array, Array]:
             cost, x_next = self._expected_cost(grid.points[part], actions[part])
-            count, nodes = x_next[0].shape
-            rows = np.repeat(np.arange(count), nodes)
-            matrix = sparse.csr_array((count, grid.size))
+            count, n_nodes = x_next[0].shape
+            shape = (count, grid.size)
+            rows = np.repeat(np.arange(count), n_nodes)
+            # From state b to each corner of the cell that node q leads to: its probability times
+            # the corner's weight. Entries of the same place add up.
+            matrix = sparse.csr_array(shape)
             for index, weight in grid.weights(x_next):
-                entries = (weight * self._weights).reshape(-1)
+                probabilities = (weight * self._weights).reshape(-1)
                 places = (rows, index.reshape(-1))
-                matrix += sparse.csr_array((entries, places), shape=(count, grid.size))
+                matrix += sparse.csr_array((probabilities, places), shape=shape)
             return matrix, cost
 
-        matrices, costs = zip(*self._map(rows_of, grid.size), strict=True)
-        return sparse.vstack(matrices, format="csr"), np.concatenate(costs)
+        parts = self._map(rows_of, grid.size)
+        matrices, costs = zip(*parts, strict=True)
+        transition = sparse.vstack(matrices, format="csr")
+        return transition, np.concatenate(costs)
 
-    def _expected_cost(self, states: Array, actions: Array) -> tuple[Array, list[Array]]:
+    def _expected_cost(
+        self,
+        states: Array,
+        actions: Array,
+    ) -> tuple[Array, list[Array]]:
         """E[ℓ + penalty(s₊)], shape (B,), and s₊ at the nodes, n arrays (B, q)."""
+        # States and actions (B, 1) with disturbances (1, q): all arrays broadcast to (B, q).
         arguments = (
             [column[:, None] for column in states.T],
             [column[:, None] for column in actions.T],
@@ -457,21 +607,26 @@ class BellmanOperator:
         )
         shape = (len(states), len(self._weights))
         x_next = [np.broadcast_to(entry, shape) for entry in self._step(*arguments)]
-        cost = _mean(np.broadcast_to(self._cost(*arguments)[0], shape), self._weights)
+        (stage_cost,) = self._cost(*arguments)
+        cost = _mean(np.broadcast_to(stage_cost, shape), self._weights)
         return cost + self._expected_penalty(x_next), x_next
 
     def _expected_penalty(self, x_next: Sequence[Array]) -> Array:
         """E[penalty(s₊)], shape (B,), of s₊ at the nodes, n arrays (B, q)."""
+        problem = self.problem
         total = np.zeros(len(x_next[0]))
         for i, x in enumerate(x_next):
             lowest = x.min(axis=1)
             highest = x.max(axis=1)
             # The outermost Gauss nodes lie inside the law's support.
             reach = 0.25 * (highest - lowest)
-            below = np.flatnonzero(-(lowest - reach - self.problem.state_lower[i]) > 0)
+            room_below = lowest - reach - problem.state_lower[i]
+            room_above = highest + reach - problem.state_upper[i]
+            # Only states that may violate a bound are worth the many nodes of the penalty.
+            below = np.flatnonzero(room_below < 0)
+            above = np.flatnonzero(room_above > 0)
             if len(below):
                 total[below] += self._expected_bound_penalty(x[below], i, -1.0)
-            above = np.flatnonzero(highest + reach - self.problem.state_upper[i] > 0)
             if len(above):
                 total[above] += self._expected_bound_penalty(x[above], i, 1.0)
         return total
@@ -484,16 +639,22 @@ class BellmanOperator:
         """
         problem = self.problem
         bound = problem.state_upper[i] if sign > 0 else problem.state_lower[i]
-        violation = np.maximum(sign * (self._refine(x) - bound), 0.0)
-        slope = problem.penalty_linear[i] + problem.penalty_quadratic[i] * violation
-        return _mean(slope * violation, self._penalty_weights)
+        linear = problem.penalty_linear[i]
+        quadratic = problem.penalty_quadratic[i]
+        excess = sign * (self._refine(x) - bound)
+        violation = np.maximum(excess, 0.0)
+        penalty = (linear + quadratic * violation) * violation
+        return _mean(penalty, self._penalty_weights)
 
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
         """Results of a task for slices of `count` states, by the threads where there are any."""
-        tasks = -(-count * len(self._weights) // _ENTRIES)  # rounded up
-        edges = np.linspace(0, count, min(tasks, count) + 1).astype(int)
+        entries = count * len(self._weights)
+        n_tasks = min(-(-entries // ENTRIES_A_TASK), count)  # rounded up
+        edges = np.linspace(0, count, n_tasks + 1).astype(int)
         parts = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
-        return self._pool.map(task, parts) if self._pool else map(task, parts)
+        if self._pool is None:
+            return map(task, parts)
+        return self._pool.map(task, parts)
 
 
 def _mean(values: Array, weights: Array) -> Array:
@@ -525,10 +686,11 @@ class Settings:
 
     def accuracy(self, plant: PlantProblem) -> Accuracy:
         """Integrator and quadrature for a problem."""
-        count = len(plant.law.nominal)
         # The first two disturbances move the state most.
-        nodes = (7, 7, *(2,) * count)[:count]
-        penalty_nodes = (20, 20, 4, *(2,) * count)[:count]
+        count = len(plant.law.nominal)
+        others = (2,) * count
+        nodes = (7, 7, *others)[:count]
+        penalty_nodes = (20, 20, 4, *others)[:count]
         return Accuracy(
             substeps=accurate_substeps(plant, self.integration_tolerance),
             nodes=self.nodes or nodes,
@@ -550,24 +712,37 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
         OptimumError: 128 substeps are too few.
     """
     problem = plant.problem
+    state_lower = problem.state_lower
+    state_upper = problem.state_upper
+    reference = problem.reference_state
+
+    # Points (count, n), (count, m) and (count, n_d) that the closed loop may visit.
     generator = np.random.default_rng(0)
     count = 2000
-    reach = 0.25 * (problem.state_upper - problem.state_lower)
-    lower = np.maximum(problem.state_lower, problem.reference_state - reach)
-    upper = np.minimum(problem.state_upper, problem.reference_state + reach)
+    reach = 0.25 * (state_upper - state_lower)
+    lower = np.maximum(state_lower, reference - reach)
+    upper = np.minimum(state_upper, reference + reach)
     x = generator.uniform(lower, upper, (count, problem.n_states))
-    u = generator.uniform(problem.action_lower, problem.action_upper, (count, problem.n_actions))
+    u = generator.uniform(
+        problem.action_lower,
+        problem.action_upper,
+        (count, problem.n_actions),
+    )
     d = plant.law.draw(generator, count)
-    before: Array | None = None
-    for substeps in 2 ** np.arange(8):
-        step = Elementwise(discretise(problem.model, problem.sampling_time, int(substeps)))
+    allowed = tolerance * (1 + np.abs(x))
+
+    before = np.full_like(x, np.inf)
+    for power in range(8):
+        substeps = 2**power
+        step = Elementwise(discretise(problem.model, problem.sampling_time, substeps))
         # A step that is too long may overflow; then the next one is tried.
         with np.errstate(all="ignore"):
             entries = step(x.T, u.T, d.T, plant.parameters)
-            x_next = np.stack([np.broadcast_to(entry, count) for entry in entries], axis=1)
-            change = np.inf if before is None else np.abs(x_next - before)
-        if np.all(change <= tolerance * (1 + np.abs(x))):
-            return int(substeps)
+            columns = [np.broadcast_to(entry, count) for entry in entries]
+            x_next = np.stack(columns, axis=1)
+            change = np.abs(x_next - before)
+        if np.all(change <= allowed):
+            return substeps
         before = x_next
     raise OptimumError(
         f"model '{problem.model.name}': 128 RK4 substeps a sample do not integrate it to "
@@ -575,7 +750,11 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     )
 
 
-def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) -> Grid:
+def first_grid(
+    problem: Problem,
+    operator: BellmanOperator,
+    settings: Settings,
+) -> Grid:
     """Grid over all states within the bounds and a tenth beyond.
 
     At the reference and at the bounds, where the optimal closed loop may live, its cells are half a
@@ -588,14 +767,18 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
     """
     deviation = operator.deviation(problem.reference_state, problem.reference_action)
     axes = []
-    for low, high, centre, sigma in zip(
-        problem.state_lower, problem.state_upper, problem.reference_state, deviation, strict=True
-    ):
-        span = high - low
-        spacing = max(0.5 * sigma, 1e-3 * span)
-        features = [(x - spacing, x + spacing, spacing) for x in (low, centre, high)]
-        lower, upper = low - 0.1 * span, high + 0.1 * span
-        marks = sorted({lower, low, centre, high, upper})
+    for i in range(problem.n_states):
+        lower = problem.state_lower[i]
+        upper = problem.state_upper[i]
+        reference = problem.reference_state[i]
+        span = upper - lower
+        spacing = max(0.5 * deviation[i], 1e-3 * span)
+        features = []
+        for x in (lower, reference, upper):
+            features.append((x - spacing, x + spacing, spacing))
+        first = lower - 0.1 * span
+        last = upper + 0.1 * span
+        marks = sorted({first, lower, reference, upper, last})
         axes.append(graded_axis(marks, features, settings.growth**2))
     return Grid(tuple(axes))
 
@@ -626,17 +809,24 @@ def refined(
         The policy, interpolated linearly, with its value on the new grid.
     """
     problem = operator.problem
+    n = problem.n_states
     grid = optimum.grid
+
+    # The disturbance's effect on a sample, at the mean of state and action in the closed loop.
     mass = np.maximum(optimum.distribution, 0.0)
-    mean = mass @ np.column_stack([grid.points, optimum.actions]) / mass.sum()
-    deviation = operator.deviation(mean[: problem.n_states], mean[problem.n_states :])
-    mass = mass.reshape(grid.shape)
+    points = np.column_stack([grid.points, optimum.actions])
+    mean = mass @ points / mass.sum()
+    deviation = operator.deviation(mean[:n], mean[n:])
+
+    mass_on_grid = mass.reshape(grid.shape)
     axes = []
     intervals = []
     for i, axis in enumerate(grid.axes):
-        others = tuple(j for j in range(mass.ndim) if j != i)
-        support = _support(axis, mass.sum(axis=others), settings.tail)
-        axes.append(_refined_axis(operator, settings, level, i, axis, support, deviation[i]))
+        others = tuple(j for j in range(n) if j != i)
+        marginal = mass_on_grid.sum(axis=others)
+        support = _support(axis, marginal, settings.tail)
+        finer_axis = _refined_axis(operator, settings, level, i, axis, support, deviation[i])
+        axes.append(finer_axis)
         # Beyond a bound the value has a kink wherever the return takes one more sample.
         first = max(support[0], problem.state_lower[i])
         last = min(support[1], problem.state_upper[i])
@@ -645,8 +835,11 @@ def refined(
 
     states = list(finer.points.T)
     linear = Grid(grid.axes)
-    actions = [linear.interpolant(column)(states) for column in optimum.actions.T]
-    return start_policy(operator, finer, np.stack(actions, axis=1), 0.1)
+    columns = []
+    for action in optimum.actions.T:
+        interpolated = linear.interpolant(action)
+        columns.append(interpolated(states))
+    return start_policy(operator, finer, np.stack(columns, axis=1), 0.1)
 
 
 def _support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:
@@ -670,23 +863,29 @@ def _refined_axis(
     """Axis of state i on a grid of `level`; `deviation` is that of a sample's disturbance in it."""
     problem = operator.problem
     reference = problem.reference_state[i]
-    span = problem.state_upper[i] - problem.state_lower[i]
+    lower = problem.state_lower[i]
+    upper = problem.state_upper[i]
+    span = upper - lower
     first, last = support
     width = last - first
-    features = [(first, last, width / (settings.cells * 2**level))]
-    touched = []
+
+    # Dense within the support, and about each bound that the closed loop touches.
+    refinement = 2**level
+    features = [(first, last, width / (settings.cells * refinement))]
+    marks = {reference}
     near = max(deviation, 1e-3 * span)
-    for bound in (problem.state_lower[i], problem.state_upper[i]):
+    for bound in (lower, upper):
         if first - deviation <= bound <= last + deviation:
-            touched.append(bound)
-            features.append((bound - near, bound + near, near / 2**level))
+            marks.add(bound)
+            features.append((bound - near, bound + near, near / refinement))
 
     # Without disturbance a state that strays never comes into the support's mass: keep the box.
-    beyond = max(width, (1.0 if operator.deterministic else 0.05) * span)
+    share = 1.0 if operator.deterministic else 0.05
+    beyond = max(width, share * span)
     low = max(axis[0], min(first, reference) - beyond)
     high = min(axis[-1], max(last, reference) + beyond)
-    inside = [x for x in sorted({*touched, reference}) if low < x < high]
-    return graded_axis([low, *inside, high], features, settings.growth)
+    inner_marks = [x for x in sorted(marks) if low < x < high]
+    return graded_axis([low, *inner_marks, high], features, settings.growth)
 
 
 Objective = Callable[[Indices, Array], Array]
@@ -719,58 +918,87 @@ def nelder_mead(
     Returns:
         Minimisers (B, m) and values (B,), never worse than the start.
     """
-    count, m = start.shape
-    everyone = np.arange(count)
-    vertices = np.repeat(np.clip(start, lower, upper)[:, None], m + 1, axis=1)
-    for i in range(m):
-        vertex = vertices[:, i + 1, i]
-        outward = vertex + size[:, i]
-        inward = np.where(outward > upper[i], vertex - size[:, i], outward)
-        vertices[:, i + 1, i] = np.clip(inward, lower[i], upper[i])
-    values = np.stack([objective(everyone, vertices[:, i]) for i in range(m + 1)], axis=1)
+    m = start.shape[1]
+    every_row = np.arange(len(start))
+    vertices = _first_simplices(start, size, lower, upper)
+    columns = [objective(every_row, vertices[:, i]) for i in range(m + 1)]
+    values = np.stack(columns, axis=1)
 
     for _ in range(iterations):
+        # The best vertex first, the worst one last.
         order = np.argsort(values, axis=1, kind="stable")
         values = np.take_along_axis(values, order, axis=1)
         vertices = np.take_along_axis(vertices, order[:, :, None], axis=1)
-        rows = np.flatnonzero(values[:, -1] - values[:, 0] > precision)
+        spread = values[:, -1] - values[:, 0]
+        rows = np.flatnonzero(spread > precision)
         if not len(rows):
             break
+        best = values[rows, 0]
+        second_worst = values[rows, -2]
+        worst = values[rows, -1]
 
+        # Reflect the worst vertex at the centre of the others.
+        worst_vertex = vertices[rows, -1]
         centre = vertices[rows, :-1].mean(axis=1)
-        worst = vertices[rows, -1]
-        candidate = np.clip(2.0 * centre - worst, lower, upper)
+        candidate = np.clip(2.0 * centre - worst_vertex, lower, upper)
         reflected = objective(rows, candidate)
-        is_best = reflected < values[rows, 0]
-        is_accepted = reflected < values[rows, -2]
+        is_best = reflected < best
+        is_accepted = reflected < second_worst
 
         # Expansion, outside contraction and inside contraction as multiples of centre − worst.
-        contraction = np.where(reflected < values[rows, -1], 0.5, -0.5)
-        factor = np.where(is_best, 2.0, contraction)
-        trial = np.clip(centre + factor[:, None] * (centre - worst), lower, upper)
+        contraction = np.where(reflected < worst, 0.5, -0.5)
+        factor = np.where(is_best, 2.0, contraction)[:, None]
+        trial = np.clip(centre + factor * (centre - worst_vertex), lower, upper)
         tried = np.flatnonzero(is_best | ~is_accepted)
         outcome = np.full(len(rows), np.inf)
         if len(tried):
             outcome[tried] = objective(rows[tried], trial[tried])
-        candidate = np.where((outcome < reflected)[:, None], trial, candidate)
+        trial_is_better = (outcome < reflected)[:, None]
+        candidate = np.where(trial_is_better, trial, candidate)
         outcome = np.minimum(outcome, reflected)
 
-        improved = outcome < values[rows, -1]
+        improved = outcome < worst
         vertices[rows[improved], -1] = candidate[improved]
         values[rows[improved], -1] = outcome[improved]
         # What no point improved shrinks towards its best vertex.
         shrinking = rows[~improved]
+        if not len(shrinking):
+            continue
         for i in range(1, m + 1):
-            if len(shrinking):
-                halfway = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
-                vertices[shrinking, i] = halfway
-                values[shrinking, i] = objective(shrinking, halfway)
-    best = values.argmin(axis=1)
-    return vertices[everyone, best], values[everyone, best]
+            halfway = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
+            vertices[shrinking, i] = halfway
+            values[shrinking, i] = objective(shrinking, halfway)
+
+    best_vertex = values.argmin(axis=1)
+    return vertices[every_row, best_vertex], values[every_row, best_vertex]
+
+
+def _first_simplices(
+    start: Array,
+    size: Array,
+    lower: Array,
+    upper: Array,
+) -> Array:
+    """Vertices (B, m+1, m) of simplices with edges along the axes, within the box."""
+    m = start.shape[1]
+    inside = np.clip(start, lower, upper)
+    vertices = np.repeat(inside[:, None], m + 1, axis=1)
+    for i in range(m):
+        # Vertex i+1 differs from the start in entry i, inwards where outwards leaves the box.
+        entry = vertices[:, i + 1, i]
+        outward = entry + size[:, i]
+        inward = entry - size[:, i]
+        moved = np.where(outward > upper[i], inward, outward)
+        vertices[:, i + 1, i] = np.clip(moved, lower[i], upper[i])
+    return vertices
 
 
 def scan(
-    objective: Objective, start: Array, lower: Array, upper: Array, points: int
+    objective: Objective,
+    start: Array,
+    lower: Array,
+    upper: Array,
+    points: int,
 ) -> tuple[Array, Array]:
     """Best of a start and of a grid over the box, for B functions.
 
@@ -784,22 +1012,22 @@ def scan(
     Returns:
         The best point (B, m) of each function, and its value (B,).
     """
-    everyone = np.arange(len(start))
+    every_row = np.arange(len(start))
     best = start.copy()
-    values = objective(everyone, start)
+    values = objective(every_row, start)
     axes = [np.linspace(low, high, points) for low, high in zip(lower, upper, strict=True)]
     for point in itertools.product(*axes):
         candidate = np.broadcast_to(point, start.shape)
-        outcome = objective(everyone, candidate)
+        outcome = objective(every_row, candidate)
         better = outcome < values
         best[better] = np.array(point)
         values[better] = outcome[better]
     return best, values
 
 
-# Probability that a sample starts anew at the anchor: so a plant without disturbance, which may
-# come to rest in several places, has one gain. It shifts J* by 1e-10 of itself.
-_RESTART = 1e-9
+RESTART_PROBABILITY = 1e-9
+"""Probability that a sample starts anew at the anchor: so a plant without disturbance, which may
+come to rest in several places, has one gain. It shifts J* by 1e-10 of itself."""
 
 
 class GainEstimate(NamedTuple):
@@ -835,13 +1063,17 @@ class Optimum:
     @property
     def edge_mass(self) -> float:
         """Share of samples that the closed loop spends on the edge of the grid's box."""
-        ends = np.array([axis[[0, -1]] for axis in self.grid.axes])[:, :, None]
-        on_edge = (self.grid.points.T[:, None] == ends).any(axis=(0, 1))
+        on_edge = np.zeros(self.grid.size, dtype=bool)
+        for axis, x in zip(self.grid.axes, self.grid.points.T, strict=True):
+            on_edge |= (x == axis[0]) | (x == axis[-1])
         return float(self.distribution[on_edge].sum())
 
 
 def evaluate_policy(
-    operator: BellmanOperator, grid: Grid, actions: Array, anchor: int
+    operator: BellmanOperator,
+    grid: Grid,
+    actions: Array,
+    anchor: int,
 ) -> tuple[Array, float, Array]:
     """Value, gain and stationary distribution of a policy.
 
@@ -862,24 +1094,33 @@ def evaluate_policy(
     from scipy import sparse  # noqa: PLC0415
     from scipy.sparse.linalg import splu  # noqa: PLC0415
 
-    matrix, cost = operator.chain(actions, grid)
+    # [I − P  1; e_anchorᵀ  0] (W, g) = (c, 0).
+    transition, cost = operator.chain(actions, grid)
     size = grid.size
     unit = sparse.csr_array(([1.0], ([0], [anchor])), shape=(1, size))
-    flow = sparse.eye_array(size) - (1.0 - _RESTART) * matrix
-    bordered = sparse.block_array([[flow, np.ones((size, 1))], [unit, None]], format="csc")
+    flow = sparse.eye_array(size) - (1.0 - RESTART_PROBABILITY) * transition
+    ones = np.ones((size, 1))
+    bordered = sparse.block_array([[flow, ones], [unit, None]], format="csc")
     try:
         factors = splu(bordered)
     except RuntimeError as error:
         raise OptimumError(f"policy evaluation on a grid of {size} states: {error}") from error
-    stationary = factors.solve(np.append(np.zeros(size), 1.0), trans="T")
-    # The transposed system's last row makes the multipliers a distribution: they sum to 1.
-    distribution = stationary[:size]
     solution = factors.solve(np.append(cost, 0.0))
-    return solution[:size], float(solution[size]), distribution
+    W = solution[:size]
+    gain = float(solution[size])
+
+    # The transposed system's last row makes the multipliers a distribution: they sum to 1.
+    sum_is_one = np.append(np.zeros(size), 1.0)
+    stationary = factors.solve(sum_is_one, trans="T")
+    distribution = stationary[:size]
+    return W, gain, distribution
 
 
 def start_policy(
-    operator: BellmanOperator, grid: Grid, actions: Array, share: float = 1.0
+    operator: BellmanOperator,
+    grid: Grid,
+    actions: Array,
+    share: float = 1.0,
 ) -> Optimum:
     """Evaluate a first policy; its `step` is a tenth of the action box times `share`.
 
@@ -890,13 +1131,25 @@ def start_policy(
         share: How far the next improvement looks, as a share of a tenth of the action box.
     """
     problem = operator.problem
-    width = problem.action_upper - problem.action_lower
-    W, gain, mass = evaluate_policy(operator, grid, actions, grid.nearest(problem.reference_state))
-    step = share * np.tile(0.1 * width, (grid.size, 1))
-    return Optimum(grid, actions, W, gain, mass, operator.accuracy, step=step)
+    anchor = grid.nearest(problem.reference_state)
+    W, gain, distribution = evaluate_policy(operator, grid, actions, anchor)
+    tenth = 0.1 * (problem.action_upper - problem.action_lower)
+    return Optimum(
+        grid=grid,
+        actions=actions,
+        W=W,
+        gain=gain,
+        distribution=distribution,
+        accuracy=operator.accuracy,
+        step=share * np.tile(tenth, (grid.size, 1)),
+    )
 
 
-def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int) -> Optimum:
+def improve_policy(
+    operator: BellmanOperator,
+    iterate: Optimum,
+    scan_points: int,
+) -> Optimum:
     """Improve the policy once and bound the remaining gain.
 
     Each state has a local search from its present action or from a better one of a scan over the
@@ -918,8 +1171,10 @@ def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int
         return operator.values(grid.points[rows], actions, grid, iterate.W)
 
     start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
+    # A simplex twice as large as the last change of an action finds the next one.
     width = upper - lower
-    size = np.clip(2.0 * np.abs(iterate.step), 2e-3 * width, 0.1 * width)
+    wanted = 2.0 * np.abs(iterate.step)
+    size = np.clip(wanted, 2e-3 * width, 0.1 * width)
     actions, values = nelder_mead(
         objective,
         start,
@@ -963,7 +1218,8 @@ def objection(certificate: Sequence[GainEstimate]) -> str | None:
     search = estimates.pop(SEARCH, None)
     percent = 100 * CERTIFICATE_TOLERANCE
     values = [estimate.value for estimate in estimates.values()]
-    spread = (max(values) - min(values)) / abs(min(values))
+    least = min(values)
+    spread = (max(values) - least) / abs(least)
     if spread > CERTIFICATE_TOLERANCE:
         names = ", ".join(estimates)
         return f"{names} are {100 * spread:.3f} % apart, more than {percent:g} %"
@@ -971,7 +1227,9 @@ def objection(certificate: Sequence[GainEstimate]) -> str | None:
     for estimate in estimates.values():
         if estimate.upper - estimate.lower > 2 * allowed:
             return f"the interval of the {estimate.name} is wider than {2 * allowed:.3g}"
-    if search is not None and search.upper < estimates["refinement"].value - allowed:
+    if search is None:
+        return None
+    if search.upper < estimates["refinement"].value - allowed:
         return (
             f"a policy search found {search.value:.2f}, more than {percent:g} % "
             "below the refinement"
@@ -1003,24 +1261,27 @@ def solve(
     accuracy = settings.accuracy(plant)
     draft = BellmanOperator(plant, accuracy.draft(), workers=workers)
     operator = BellmanOperator(plant, accuracy, workers=workers)
-    grid = first_grid(problem, draft, settings)
-    iterate = start_policy(draft, grid, np.tile(problem.reference_action, (grid.size, 1)))
     run = partial(_iterate, settings=settings, progress=progress)
     approach = partial(run, draft, scan_points=5, start_only=True)
+
+    # From the constant policy u_s to a first policy on the coarse grid.
+    grid = first_grid(problem, draft, settings)
+    constant = np.tile(problem.reference_action, (grid.size, 1))
+    iterate = start_policy(draft, grid, constant)
+    iterate = approach(iterate, 0)
+
     # Linear interpolation is monotone, so it converges from any start; it smears the closed loop
     # over its cells, so the support is known only once these are fine.
-    grids = []
     if settings.level:
-        grids = [(1, False)]
-        for finer in range(1, settings.level + 1):
-            grids.append((finer, True))
-    level = 0
-    for finer, smooth in grids:
-        iterate = refined(draft, approach(iterate, level), settings, finer, smooth=smooth)
-        level = finer
+        iterate = refined(draft, iterate, settings, 1, smooth=False)
+        iterate = approach(iterate, 1)
+    for level in range(1, settings.level + 1):
+        iterate = refined(draft, iterate, settings, level)
+        iterate = approach(iterate, level)
+
     # One round that looks for better actions in the whole action box.
-    iterate = run(draft, approach(iterate, level), level, scan_points=9, rounds=1)
-    return _accepted(run(operator, iterate, level))
+    iterate = run(draft, iterate, settings.level, scan_points=9, rounds=1)
+    return _accepted(run(operator, iterate, settings.level))
 
 
 def _iterate(
@@ -1035,11 +1296,12 @@ def _iterate(
     start_only: bool = False,
 ) -> Optimum:
     """Improve and evaluate until the bounds meet or, where `start_only`, the gain rests."""
-    anchor = iterate.grid.nearest(operator.problem.reference_state)
+    grid = iterate.grid
+    anchor = grid.nearest(operator.problem.reference_state)
     for k in range(rounds or settings.rounds):
         last_gain = iterate.gain
         better = improve_policy(operator, iterate, scan_points)
-        W, gain, distribution = evaluate_policy(operator, better.grid, better.actions, anchor)
+        W, gain, distribution = evaluate_policy(operator, grid, better.actions, anchor)
         iterate = replace(
             better,
             W=W,
@@ -1049,11 +1311,14 @@ def _iterate(
         )
         if progress is not None:
             progress(level, k, iterate)
+        # A start is good enough once the gain rests; a solution has bounds that meet.
         if start_only:
-            done = last_gain - gain <= 1e-4 * abs(gain)
+            distance = last_gain - gain
+            allowed = 1e-4 * abs(gain)
         else:
-            done = iterate.upper - iterate.lower <= settings.tolerance * abs(gain)
-        if done:
+            distance = iterate.upper - iterate.lower
+            allowed = settings.tolerance * abs(gain)
+        if distance <= allowed:
             break
     return iterate
 
@@ -1061,7 +1326,8 @@ def _iterate(
 def _accepted(optimum: Optimum) -> Optimum:
     """The optimum with bounds about its gain; raises OptimumError where it is none (`solve`)."""
     gain = optimum.gain
-    if optimum.upper - optimum.lower > 0.01 * abs(gain):
+    distance = optimum.upper - optimum.lower
+    if distance > 0.01 * abs(gain):
         raise OptimumError(
             f"policy iteration: the bounds of the gain, {optimum.lower:.6g} and "
             f"{optimum.upper:.6g}, are more than 1 % apart; allow more rounds or another grid"
@@ -1104,10 +1370,13 @@ def simulate_policy(
     burn_in = 300
     rng = np.random.default_rng(0)
     problem = plant.problem
-    step = Elementwise(discretise(problem.model, problem.sampling_time, optimum.accuracy.substeps))
-    stage_cost = Elementwise(economic_cost(problem.model))
+    model = problem.model
+    parameters = plant.parameters
+    step = Elementwise(discretise(model, problem.sampling_time, optimum.accuracy.substeps))
+    stage_cost = Elementwise(economic_cost(model))
     grid = Grid(optimum.grid.axes)
     policy = [grid.interpolant(column) for column in optimum.actions.T]
+
     probabilities = optimum.distribution / optimum.distribution.sum()
     start = rng.choice(grid.size, paths, p=probabilities)
     # An array (paths,) for each state, action and disturbance.
@@ -1115,13 +1384,16 @@ def simulate_policy(
     total = np.zeros(paths)
     for k in range(burn_in + steps):
         u = [action(x) for action in policy]
-        d = list(plant.law.draw(rng, paths).T)
+        disturbances = plant.law.draw(rng, paths)
+        d = list(disturbances.T)
         if k >= burn_in:
-            total += stage_cost(x, u, d, plant.parameters)[0]
+            (cost,) = stage_cost(x, u, d, parameters)
+            total += cost
             total += problem.penalty.along(np.stack(x, axis=1))
-        next_x = step(x, u, d, plant.parameters)
+        x_next = step(x, u, d, parameters)
         # A state that depends on no other may be one number.
-        x = [np.broadcast_to(state, paths) for state in next_x]
+        x = [np.broadcast_to(state, paths) for state in x_next]
+
     means = total / steps
     half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
     return float(means.mean()), float(half_width)
@@ -1156,11 +1428,11 @@ def certify(
     operator = BellmanOperator(plant, optimum.accuracy, workers=2)
     level = settings.level + 1
     start = refined(operator, optimum, settings, level)
-    refinement = _accepted(_iterate(operator, start, level, settings, progress))
+    iterate = _iterate(operator, start, level, settings, progress)
+    refinement = _accepted(iterate)
     mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
-    certificate = (
-        GainEstimate("solution", optimum.gain, optimum.lower, optimum.upper),
-        GainEstimate("refinement", refinement.gain, refinement.lower, refinement.upper),
-        GainEstimate("simulation", mean, mean - half_width, mean + half_width),
-    )
-    return replace(refinement, certificate=certificate)
+    estimates = []
+    for name, solution in (("solution", optimum), ("refinement", refinement)):
+        estimates.append(GainEstimate(name, solution.gain, solution.lower, solution.upper))
+    estimates.append(GainEstimate("simulation", mean, mean - half_width, mean + half_width))
+    return replace(refinement, certificate=tuple(estimates))

@@ -732,8 +732,7 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     allowed = tolerance * (1 + np.abs(x))
 
     before = np.full_like(x, np.inf)
-    for power in range(8):
-        substeps = 2**power
+    for substeps in (1, 2, 4, 8, 16, 32, 64, 128):
         step = Elementwise(discretise(problem.model, problem.sampling_time, substeps))
         # A step that is too long may overflow; then the next one is tried.
         with np.errstate(all="ignore"):

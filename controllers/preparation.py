@@ -16,15 +16,13 @@ from controllers.functions import StackedFunction
 from controllers.integration import check_integration
 from controllers.model import runge_kutta
 from controllers.problem import Problem
-from controllers.qp import SoftQp
+from controllers.qp import LEAST_SIZE, SoftQp
 from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
 from cosim.core.protocols import Vector
 from cosim.core.validation import instead
 
 SOLVED_RESIDUAL = 1e-8
 """Largest KKT residual of a QP that counts as solved."""
-LEAST_SIZE = 1e-30
-"""What a size is at least, so that it can divide."""
 
 
 def sampled_jacobian(

@@ -115,7 +115,7 @@ class ConvergedNmpc(RtiNmpc):
         """
         try:
             self._hessian.lifts = False
-            self._x[:], self._u[:], self._costates[:] = solution.unshifted
+            self._set_point(solution.unshifted)
             self._make_qp()
             self._embed_state(None if a is None else np.asarray(a, dtype=np.float64))
             self._accept(solution.multipliers, enforced=a is not None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from math import isfinite
 
@@ -17,6 +17,7 @@ KINDS = ("states", "actions", "disturbances", "parameters")
 """The kinds of a model's quantities, in the order of its functions' arguments."""
 
 ModelExpression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
+"""A function (x, u, d, p) of a model."""
 
 TEMPERATURES = ("K", "degC", "degF", "°C", "°F")
 """Units whose zero is not that of the quantity's variation."""
@@ -88,8 +89,9 @@ class Model:
     def __post_init__(self) -> None:
         for kind in KINDS:
             object.__setattr__(self, kind, self._quantities(kind))
-        quantities = [quantity for kind in KINDS for quantity in getattr(self, kind)]
-        names = [quantity.name for quantity in quantities]
+        names: list[str] = []
+        for kind in KINDS:
+            names += [quantity.name for quantity in getattr(self, kind)]
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:
             raise ModelError(
@@ -99,7 +101,7 @@ class Model:
         for kind in ("states", "actions"):
             if not getattr(self, kind):
                 raise ModelError(f"model '{self.name}' has no {kind}; it needs at least one")
-        if not (isinstance(self.time_unit, int | float) and 0 < self.time_unit < float("inf")):
+        if not _is_positive(self.time_unit):
             raise ModelError(
                 f"model '{self.name}': time_unit must be positive seconds, not {self.time_unit!r}"
             )
@@ -144,8 +146,7 @@ class Model:
                     f"number, not {quantity.nominal!r}"
                 )
             magnitude = quantity.magnitude
-            positive = isinstance(magnitude, int | float) and 0 < magnitude < float("inf")
-            if magnitude is not None and not positive:
+            if magnitude is not None and not _is_positive(magnitude):
                 raise ModelError(
                     f"model '{self.name}': the magnitude of {quantity.name} must be a positive "
                     f"number, not {magnitude!r}"
@@ -173,7 +174,9 @@ class Model:
                     f"{quantity.unit}, whose nominal value says nothing of its size; add "
                     "magnitude=… to its Quantity, ten times the deviation that you expect"
                 )
-            magnitudes.append(abs(quantity.nominal) if magnitude is None else magnitude)
+            if magnitude is None:
+                magnitude = abs(quantity.nominal)
+            magnitudes.append(magnitude)
         return np.array(magnitudes)
 
     @property
@@ -204,12 +207,16 @@ class Model:
         if len(moved) != len(names):
             raise ModelError(f"model '{self.name}' has not all of {', '.join(names)} to measure")
         # Where each of the present disturbances is among those that stay and those that moved.
-        order = [[*rest, *moved].index(quantity) for quantity in self.disturbances]
+        rearranged_order = [*rest, *moved]
+        order = [rearranged_order.index(quantity) for quantity in self.disturbances]
         count = len(self.parameters)
 
         def rearranged(expression: ModelExpression) -> ModelExpression:
             def call(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
-                return expression(x, u, ca.vertcat(d, p[count:])[order], p[:count])
+                own_parameters = p[:count]
+                measured = p[count:]
+                disturbances = ca.vertcat(d, measured)[order]
+                return expression(x, u, disturbances, own_parameters)
 
             return call
 
@@ -231,7 +238,30 @@ class Model:
         )
 
 
-def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float | ca.SX, substeps: int) -> ca.SX:
+def _is_positive(value: object) -> bool:
+    """Whether a value is a positive finite number."""
+    return isinstance(value, int | float) and 0 < value < float("inf")
+
+
+def by_name(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
+    """The entries of a column by the names of its quantities.
+
+    Args:
+        quantities: One for each entry.
+        column: x, u, d or p, as a model's functions get them.
+    """
+    entries = {}
+    for i, quantity in enumerate(quantities):
+        entries[quantity.name] = column[i]
+    return entries
+
+
+def runge_kutta(
+    rate: Callable[[ca.SX], ca.SX],
+    x: ca.SX,
+    h: float | ca.SX,
+    substeps: int,
+) -> ca.SX:
     """x after some classical RK4 steps of x' = rate(x).
 
     Args:
@@ -259,11 +289,22 @@ def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function
     """
     x, u, d, p = model.symbols()
     h = sampling_time / model.time_unit / substeps
-    x_next = runge_kutta(lambda state: model.ode(state, u, d, p), x, h, substeps)
-    return ca.Function("f", [x, u, d, p], [x_next], ["x", "u", "d", "p"], ["x_next"])
+
+    def rate(state: ca.SX) -> ca.SX:
+        return model.ode(state, u, d, p)
+
+    x_next = runge_kutta(rate, x, h, substeps)
+    return ca.Function(
+        "f",
+        [x, u, d, p],
+        [x_next],
+        ["x", "u", "d", "p"],
+        ["x_next"],
+    )
 
 
 def economic_cost(model: Model) -> ca.Function:
     """Economic cost ℓ(x, u, d, p) as a CasADi function."""
-    x, u, d, p = model.symbols()
-    return ca.Function("l", [x, u, d, p], [model.economic_cost(x, u, d, p)])
+    symbols = model.symbols()
+    cost = model.economic_cost(*symbols)
+    return ca.Function("l", list(symbols), [cost])

@@ -60,7 +60,8 @@ class ModelFunction:
         """The column (rows, 1) at x, u, d and p, symbols or numbers."""
         try:
             # Copies: what the function writes into its arguments stays its own.
-            result = self.function(*(_copy(argument) for argument in (x, u, d, p)))
+            arguments = [_copy(argument) for argument in (x, u, d, p)]
+            result = self.function(*arguments)
             column: Any = _column(result)
         except ModelError:
             raise
@@ -72,11 +73,12 @@ class ModelFunction:
             )
         if column.shape != (self.rows, 1):
             rows, columns = column.shape
-            counted = (
-                f"{rows} expression{'' if rows == 1 else 's'}"
-                if columns == 1
-                else f"a matrix of {rows} rows and {columns} columns"
-            )
+            if columns != 1:
+                counted = f"a matrix of {rows} rows and {columns} columns"
+            elif rows != 1:
+                counted = f"{rows} expressions"
+            else:
+                counted = "1 expression"
             raise self.error(
                 f"it returned {counted} in place of {self._wanted()}: {self._remedy()}"
             )
@@ -90,11 +92,16 @@ class ModelFunction:
             raise self.error(
                 "it returned an MX expression: build it of x, u, d and p, which are SX, alone"
             )
-        function = ca.Function(self.name, list(symbols), [ca.SX(column)], {"allow_free": True})
-        free = function.get_free()
+        function = ca.Function(
+            self.name,
+            list(symbols),
+            [ca.SX(column)],
+            {"allow_free": True},
+        )
+        free = [str(symbol) for symbol in function.get_free()]
         if free:
             raise self.error(
-                f"it depends on {', '.join(map(str, free))}, which is no entry of x, u, d or p: "
+                f"it depends on {', '.join(free)}, which is no entry of x, u, d or p: "
                 "make it a parameter or a disturbance of the model, or give it a number"
             )
         for k in range(function.n_instructions()):
@@ -123,7 +130,9 @@ class ModelFunction:
 
 
 def _copy(argument: Any) -> Any:
-    return argument[:, :] if isinstance(argument, ca.SX | ca.MX | ca.DM) else argument
+    if isinstance(argument, ca.SX | ca.MX | ca.DM):
+        return argument[:, :]
+    return argument
 
 
 def _column(result: Any) -> Any:
@@ -135,7 +144,7 @@ def _column(result: Any) -> Any:
             result = result[:, 0]
         if result.ndim > 1:
             return None
-        return ca.vertcat(*result.tolist()) if result.ndim else ca.SX(result.item())
+        result = result.tolist()  # a list, or a number
     if isinstance(result, list | tuple):
         return ca.vertcat(*result)
     if isinstance(result, int | float | np.number) and not isinstance(result, bool):
@@ -146,8 +155,10 @@ def _column(result: Any) -> Any:
 def _words(result: Any) -> str:
     if result is None:
         return "None"
-    shape = f" of shape {result.shape}" if isinstance(result, np.ndarray) else ""
-    return f"{type(result).__name__}{shape}"
+    kind = type(result).__name__
+    if isinstance(result, np.ndarray):
+        return f"{kind} of shape {result.shape}"
+    return kind
 
 
 def _meaning(error: Exception) -> str:

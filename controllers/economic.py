@@ -20,6 +20,8 @@ from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
 from cosim.core.protocols import Array
 
+FORCE_WEIGHT = 1e-3
+"""Price ρ of the force F at the active constraints, against the conditioning β."""
 STRICTLY_ACTIVE = 1e-6
 """Share of the largest multiplier above which a bound counts as strictly active."""
 
@@ -267,11 +269,10 @@ def convexify(
     B: Array,
     H: Array,
     C: Array,
-    weight: float = 1e-2,
 ) -> Convexification:
     """Best-conditioned convex stage cost with the same local optimum.
 
-    min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F
+    With ρ = `FORCE_WEIGHT`, min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F
     (Zanon, Gros, Diehl 2016). 𝓗(δP) telescopes along a trajectory and CᵀFC vanishes where C w = 0,
     so neither changes the optimal feedback.
 
@@ -280,7 +281,6 @@ def convexify(
         B: Jacobian by the action, (n, m).
         H: Hessian of the stage cost, (n+m, n+m).
         C: Gradients of the active constraints, (n_c, n+m).
-        weight: ρ.
 
     Raises:
         TuningError: There is no solution: the steady state is not locally optimal under these
@@ -307,7 +307,7 @@ def convexify(
     F_place = slice(count - n_F, count)
     objective = np.zeros(n_variables)
     objective[-2] = 1.0
-    objective[-1] = weight
+    objective[-1] = FORCE_WEIGHT
     quadratic = np.zeros((n_variables, n_variables))
 
     # α ≥ 0, (t, F) in the second-order cone, Hessian − I ⪰ 0, βI − Hessian ⪰ 0.
@@ -423,7 +423,7 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     try:
         # The economic cost's feedback is what the tuned one must equal: the certificate.
         economic, _ = local_feedback(A, B, steady.hessian, C)
-        convex = convexify(A, B, steady.hessian, C, 1e-3)
+        convex = convexify(A, B, steady.hessian, C)
         tuned, P = local_feedback(A, B, convex.hessian, C)
     except TuningError as error:
         raise TuningError(

@@ -222,8 +222,9 @@ class OptimalPolicy:
         self._table = table.tolist()
         # A cell's corners, and how far each one's row in the table is behind that of the first.
         self._corners = []
-        for corner in itertools.product((0, 1), repeat=len(self._axes)):
-            offset = int(np.ravel_multi_index(corner, grid.shape))
+        shape = [len(axis) for axis in self._axes]
+        for corner in itertools.product((0, 1), repeat=len(shape)):
+            offset = int(np.ravel_multi_index(corner, shape))
             self._corners.append((corner, offset))
 
     @classmethod

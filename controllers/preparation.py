@@ -751,7 +751,7 @@ def _residual(
         size = ca.fmax(size, LEAST_SIZE)
         errors.append(ca.fabs(cost + pull + nu) / size)
 
-        projection = _projected(v + nu / size, stage.lower, stage.upper)
+        projection = _symbolic_projection(v + nu / size, stage.lower, stage.upper)
         errors.append(ca.fabs(v - projection))
 
         relative_lam = stage.lam / (discounts[k] * bounds.w)
@@ -764,7 +764,7 @@ def _residual(
     return largest
 
 
-def _projected(values: ca.SX, lower: ca.SX, upper: ca.SX) -> ca.SX:
+def _symbolic_projection(values: ca.SX, lower: ca.SX, upper: ca.SX) -> ca.SX:
     """Projection of values on the box between the limits."""
     return ca.fmin(ca.fmax(values, lower), upper)
 
@@ -772,7 +772,7 @@ def _projected(values: ca.SX, lower: ca.SX, upper: ca.SX) -> ca.SX:
 def _soft_bound_error(y: ca.SX, relative_lam: ca.SX, bounds: _SoftBounds) -> ca.SX:
     """|y − prox(y + λ/w)| / (1 + |y|) of the soft bound, as in `QpSolution.residual`."""
     shifted = y + relative_lam
-    nearest = _projected(shifted, bounds.lower, bounds.upper)
+    nearest = _symbolic_projection(shifted, bounds.lower, bounds.upper)
     beyond = shifted - nearest
     charged = ca.fmax(ca.fabs(beyond) - 1, 0)
     violation = charged / (1 + 2 * bounds.W / bounds.w)

@@ -47,6 +47,7 @@ class ConvergedNmpc(RtiNmpc):
         iterations: int = 100,
     ) -> None:
         self._tolerance = tolerance
+        # The steps of SQP, unlike those of `RtiNmpc`, all belong to one feedback.
         self._max_iterations = iterations
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
@@ -79,6 +80,7 @@ class ConvergedNmpc(RtiNmpc):
         for _ in range(self._max_iterations):
             # Full steps: the last QP's solution is the next point of linearisation.
             last = solution
+            # The next linearisation writes over the costates of this one.
             last_costates = self._costates.copy()
             self._linearise_at(solution.unshifted)
             solution = self._solve_qp(s, a)

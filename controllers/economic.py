@@ -414,6 +414,7 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     Raises:
         TuningError: Steady state, local optimum or convexification do not exist.
     """
+    # The certificate compares gains, which need A and B to more digits than a controller does.
     substeps = linearisation_substeps(problem)
     steady = optimal_steady_state(dataclasses.replace(problem, substeps=substeps))
     n = problem.n_states
@@ -435,6 +436,7 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     q = steady.multipliers
     q_x = q[:n]
     C_x = C[:, :n]
+    # The storage, less what F costs at stage 0, whose state need not keep the constraints.
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
 
     # θ's quadratics are about the reference, the tuning's about the optimal steady state.
@@ -596,6 +598,7 @@ def svec_order(dimension: int) -> tuple[NDArray[np.intp], Array]:
     """
     rows, columns = np.triu_indices(dimension)
     order = np.lexsort((rows, columns))
+    # √2 makes the vectors' inner product that of the matrices.
     on_diagonal = rows == columns
     weight = np.where(on_diagonal, 1.0, np.sqrt(2.0))
     return order, weight[order]

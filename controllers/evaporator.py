@@ -86,6 +86,7 @@ def _ode(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     disturbance = by_name(DISTURBANCES, w)
     k = by_name(PARAMETER_VALUES, p)
     flows = _flows(x, u, w, p)
+    # Balances of the solute in the liquid, and of the vapour.
     solute = disturbance["F1"] * disturbance["X1"] - flows.F2 * X2
     vapour = flows.F4 - flows.F5
     return ca.vertcat(solute / k["M"], vapour / k["C"])

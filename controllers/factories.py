@@ -40,6 +40,7 @@ def nmpc(
     problem = Problem.from_scenario(scenario)
     settings = scenario.controller
     if kind == "converged":
+        # Its Hessian is the exact one, and it iterates to convergence: it has no use for the rest.
         return ConvergedNmpc(problem, parameters, backend=settings.backend)
     if kind != "rti":
         raise ControllerError(f"there is no NMPC '{kind}'; there are rti and converged")

@@ -261,6 +261,7 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
     """
     if switch() == "never":
         return None
+    # A library is named by a digest of its files, which is taken of bytes.
     files = {}
     for name, source in sources.items():
         files[name] = source.encode() if isinstance(source, str) else source
@@ -292,6 +293,7 @@ def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
     """
     digest = hashlib.sha256("\0".join(system).encode())
     for name in sorted(files):
+        # With its length, so that no file can be taken for the end of another.
         content = files[name]
         digest.update(f"\0{name}\0{len(content)}\0".encode())
         digest.update(content)
@@ -322,6 +324,7 @@ def _make(
 def _stored_build(name: str) -> bytes | None:
     """Content of a library of `BUILDS`; None where it is not there."""
     try:
+        # An installation may lack the builds: then what is needed is compiled.
         with tarfile.open(BUILDS) as builds:
             build = builds.extractfile(name)
             assert build is not None, "only files are in it"
@@ -334,6 +337,7 @@ def _compiled(compiler: str, files: Mapping[str, bytes], folder: Path) -> bool:
     """Compile the files to `library` in a folder; whether it is there."""
     for name, content in files.items():
         (folder / name).write_bytes(content)
+    # The other files are headers, which the units include.
     units = sorted(name for name in files if name.endswith(".c"))
     command = [compiler, *FLAGS, "-o", "library", *units, "-lm"]
     try:

@@ -58,6 +58,7 @@ def torch_layer(controller: RtiNmpc) -> Layer:
 
             if needed:
                 ctx.save_for_backward(*map(tensor, DERIVATIVES))
+            # One θ for all rows gets the sum of its gradients, which its shape says.
             ctx.theta = theta
             ctx.enforced = enforced
             return tensor("action"), tensor("value")
@@ -113,6 +114,7 @@ def jax_layer(controller: RtiNmpc) -> Layer:
             arrays = [getattr(solution, name) for name in names]
             return tuple(array.astype(dtype) for array in arrays)
 
+        # JAX traces shapes, not values: what a callback returns must be declared.
         results = []
         for name in names:
             shape = (len(states), *shapes[name])

@@ -27,6 +27,7 @@ class Lqr:
         self.problem = problem
         H = tune(problem).convexification.hessian
         A, B = linear_model(problem)
+        # In the convexified Hessian the active bounds are a cost.
         no_constraints = np.zeros((0, len(H)))
         gain, _ = local_feedback(A, B, H, no_constraints)
         self.gain = -gain
@@ -100,6 +101,7 @@ class PiLoops:
         u = problem.reference_action + self.gain * (error + self._integral)
         action: Array = np.clip(u, problem.action_lower, problem.action_upper)
         # At a bound the integral stops where it would push on (conditional integration).
+        # The error and what the action lacks have one direction where the integral winds up.
         beyond = u - action
         winds_up = beyond * self.gain * error > 0.0
         increment = error / self.reset_time

@@ -128,12 +128,14 @@ class ModelFunction:
             [ca.SX(column)],
             {"allow_free": True},
         )
+        # A symbol of somebody else's would have no value in any later call.
         free = [str(symbol) for symbol in function.get_free()]
         if free:
             raise self.error(
                 f"it depends on {', '.join(free)}, which is no entry of x, u, d or p: "
                 "make it a parameter or a disturbance of the model, or give it a number"
             )
+        # A constant that is not finite would be a NaN in every QP, far from its cause.
         for k in range(function.n_instructions()):
             if function.instruction_id(k) != ca.OP_CONST:
                 continue
@@ -177,6 +179,7 @@ def _column(result: Any) -> Any:
         result = result.tolist()  # a list, or a number
     if isinstance(result, list | tuple):
         return ca.vertcat(*result)
+    # A comparison that Python has made is a bool, and no cost.
     if isinstance(result, int | float | np.number) and not isinstance(result, bool):
         return ca.SX(float(result))
     return None
@@ -254,7 +257,9 @@ class Model:
 
     def __post_init__(self) -> None:
         for kind in KINDS:
+            # Tuples, whatever sequence was given: a frozen model stays as it was checked.
             object.__setattr__(self, kind, self._quantities(kind))
+        # Scenarios, files and messages know a quantity by its name alone.
         names: list[str] = []
         for kind in KINDS:
             names += [quantity.name for quantity in getattr(self, kind)]
@@ -273,6 +278,7 @@ class Model:
             )
         object.__setattr__(self, "uncertain", tuple(self.uncertain))
         self.parameter_indices(self.uncertain)
+        # Called once with symbols: a mistake is reported where the model is made.
         for name, rows in (("ode", len(self.states)), ("economic_cost", 1)):
             function = getattr(self, name)
             if not callable(function):
@@ -303,6 +309,7 @@ class Model:
                     f"model '{self.name}': one of the {kind} has no name: {quantity!r}"
                 )
             try:
+                # A user may have written anything, which need not be a number.
                 finite = isfinite(quantity.nominal)
             except TypeError:
                 finite = False
@@ -379,6 +386,7 @@ class Model:
 
         def rearranged(expression: ModelExpression) -> ModelExpression:
             def call(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
+                # The model's own functions still get what they were written for.
                 own_parameters = p[:count]
                 measured = p[count:]
                 disturbances = ca.vertcat(d, measured)[order]
@@ -454,6 +462,7 @@ def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function
         substeps: Number of RK4 steps a sample.
     """
     x, u, d, p = model.symbols()
+    # A sample is in seconds, the model's rates in its own unit of time.
     h = sampling_time / model.time_unit / substeps
 
     def rate(state: ca.SX) -> ca.SX:

@@ -58,6 +58,7 @@ def optimum_key(plant: PlantProblem, settings: Settings) -> str:
     problem = plant.problem
     model = problem.model
     law = plant.law
+    # Of the model's functions what they compute, not how they are written.
     symbols = model.symbols()
     rates = model.ode(*symbols)
     cost = model.economic_cost(*symbols)
@@ -162,6 +163,7 @@ def read_optimum(path: Path, key: str) -> Optimum:
     try:
         arrays = read_arrays(path)
         document = json.loads(str(arrays.pop("document")))
+        # A file may have been renamed, and then it is another problem's.
         if document["key"] != key:
             raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
         return _optimum_of(arrays, document)
@@ -176,6 +178,7 @@ def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optim
     """The optimum in a file's arrays and document."""
     n_axes = sum(name.startswith("axis_") for name in arrays)
     axes = [arrays[f"axis_{i}"] for i in range(n_axes)]
+    # JSON has lists for tuples, and may have a whole number for a float.
     smooth = document["smooth"]
     if smooth:
         intervals = [(float(first), float(last)) for first, last in smooth]
@@ -363,6 +366,7 @@ def fouling(scenario: Scenario) -> tuple[str, Callable[[ArrayLike], Vector]] | N
     rate = float(given.get("fouling_rate", 0.0))
     floor = float(given.get("fouling_floor", 0.7))
     period = float(given.get("cleaning_period", 0.0))
+    # The plant does not foul, or does so without an effect.
     if rate == 0.0 or floor == 1.0:
         return None
     if not period > 0.0:
@@ -469,6 +473,7 @@ def _jumps(scenario: Scenario, changes: Sequence[ChangeTable]) -> Change:
         parameters=parameters,
         position=position,
         times=starts[:-1],
+        # The last plant has no end, so it has no share of the mean.
         weights=np.diff(starts) / starts[-1],
     )
 
@@ -557,6 +562,7 @@ class QuasiStaticPolicy:
         from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second
 
         nodes = np.arange(len(self.policies))
+        # Another cubic could overshoot between the nodes.
         interpolate = PchipInterpolator(nodes, self.gains)
         gains: Vector = interpolate(self.law.position(time))
         return gains
@@ -604,6 +610,7 @@ def stored_optimum(scenario: Scenario) -> str | None:
     if is_file(scenario.plant.fmu) and scenario.plant.model is None:
         return None
     change = change_of(scenario)
+    # An optimum that is not stored would be solved for minutes: nobody has asked for that.
     for plant in change.plants if change else [scenario]:
         try:
             problem = PlantProblem.from_scenario(plant)

@@ -123,6 +123,7 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     offset = offset - B @ (u - u_s)
     offset = offset + symbols["c_f"]
 
+    # The transposes, since CasADi's memory is by columns and C's by rows.
     per_state = 1 / scale.state
     state_units = ca.DM(np.outer(per_state, scale.state))
     action_units = ca.DM(np.outer(per_state, scale.action))
@@ -404,6 +405,7 @@ def _gather(source: ca.MX, positions: NDArray[np.int64]) -> ca.MX:
 
 def _hessian_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     """Positions of H's entries, (Nm, Nm), in the rows of all stages; its upper triangle mirrors."""
+    # The Hessian is symmetric: of a pair of controls the later one's row has the entry.
     first, second = np.indices((horizon * m, horizon * m))
     # Row a of stage k, and control b of stage j ≤ k, whose age there is k − j.
     k, a = np.divmod(np.maximum(first, second), m)
@@ -471,6 +473,7 @@ def embedding(
         "upper": ca.repmat(upper, horizon, 1) - free,
     }
 
+    # The three functions work in one memory: nothing is copied between them.
     shared = {name: prepared.part(name) for name in condensed}
     shared["theta"] = prepared.inputs["theta"]
     shared["s"] = read.inputs["s"]
@@ -854,6 +857,7 @@ class GaussNewton:
         self.discounts = problem.discounts[:-1]
         self._end_discount = float(problem.discounts[-1])
         scale = problem.scale
+        # A derivative by scaled variables has their scales as factors.
         self.bend = np.outer(scale.both, scale.both) / scale.cost
         self.slope = scale.both / scale.cost
         # Views of the preparation's memory: what is written to them is in the QP.
@@ -914,6 +918,7 @@ class Exact(GaussNewton):
         self.lifts = True
         self._reference = problem.reference
         self._ranges = problem.scale.ranges
+        # Over the ranges, and relative to the level of the cost, eigenvalues have no unit.
         self.metric = np.outer(self._ranges, self._ranges) / problem.scale.level
         self._curvature = _curvature_by_stage(problem, blocks)
         self.functions["CURVATURE"] = self._curvature
@@ -928,6 +933,7 @@ class Exact(GaussNewton):
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write the convexified blocks and the gradients that go with them; see `GaussNewton`."""
         curvature = self._curvature
+        # The curvature of the dynamics along χ̄, at the point of linearisation.
         curvature.inputs["x"][:] = x.reshape(-1)
         curvature.inputs["u"][:] = u.reshape(-1)
         curvature.inputs["guess"][:] = costates.reshape(-1)
@@ -1008,10 +1014,12 @@ class SampleFunctions:
     def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
         if hessian not in HESSIANS:
             raise ControllerError(f"there is no Hessian '{hessian}'{instead(hessian, HESSIANS)}")
+        # First of all, since a model that is too stiff makes no controller.
         self.integration = check_integration(problem)
         self.problem = problem
         self.blocks = blocks
         self.preparation = preparation(problem, blocks)
+        # The read-out and the embedding read what the preparation writes.
         self.readout = readout(problem, blocks, self.preparation)
         self.embedding = embedding(problem, blocks, self.preparation, self.readout)
         self.hessian = HESSIANS[hessian](problem, blocks, self.preparation)

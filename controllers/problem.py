@@ -152,6 +152,7 @@ def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
     below = reference <= problem.lower + near
     above = reference >= problem.upper - near
     bound_multipliers = multipliers(gradient * both, rates * both, below, above)
+    # Over a step of each variable, so that all sizes are costs.
     second_order = np.abs(curvature * both**2)
     sizes = {
         "multiplier": float(bound_multipliers[:n].max()),
@@ -203,6 +204,7 @@ def multipliers(
     """
     n_bounds = gradient.size
     size = np.abs(gradient).max()
+    # Without a gradient nothing pushes; what is not finite is reported elsewhere.
     finite = np.isfinite(gradient).all() and np.isfinite(rates).all()
     if not size or not finite:
         return np.zeros(n_bounds)
@@ -314,6 +316,7 @@ class Problem:
             upper = getattr(self, f"{kind}_upper")
             if not (lower < upper).all():
                 raise ModelError(f"problem: {kind}_lower must be below {kind}_upper everywhere")
+        # A slack without a price would be free, and one without curvature makes the QP degenerate.
         weights = np.concatenate([self.penalty_linear, self.penalty_quadratic])
         if (weights <= 0).any():
             raise ModelError("problem: penalty_linear and penalty_quadratic must be positive")
@@ -560,6 +563,7 @@ class PlantProblem:
         if plant.model is not None:
             problem = replace(problem, model=load_model(plant.model))
         model = problem.model
+        # The optimum is that of the plant only if both mean the same, in the same order.
         needed = "the optimum needs a model of the plant"
         for kind in ("states", "actions", "disturbances"):
             ours = [quantity.name for quantity in getattr(model, kind)]

@@ -48,6 +48,7 @@ def _theta_lagrangian(
             side, (n+m, N(n+m)); None where the Hessian is the cost's own.
     """
     horizon = problem.horizon
+    # What does not hold θ has no part in the derivative, and is left out.
     gamma = problem.discount
     B_l = symbols["B_l"]
     b_l = symbols["b_l"]
@@ -156,6 +157,7 @@ class _Sensitivities:
         price = ca.repmat(ca.DM(scale.state_price), 1, horizon)
         v = self.scaled["v"] * action_scale
         lam = self.scaled["lam"] * price
+        # The QP's own numbers come as they are, so the conversion is part of the function.
         unscaled = [self.y["v"], self.y["lam"]]
         (substituted,) = ca.substitute([expression], unscaled, [v, lam])
         return substituted
@@ -212,6 +214,7 @@ class _Sensitivities:
             direction = self._direction(qp, column, unit)
             moved_solution = ca.veccat(*direction.values())
             derivative = ca.jtimes(self.gradient, ca.veccat(*moving), moved_solution)
+            # dy/dθ is minus the inverse KKT matrix times ∇θ∇_y: hence the sign.
             policy.append(-self.in_scaled_units(derivative))
             d_chi = direction["chi"]
             by_state.append(-d_chi[:, 0])
@@ -386,6 +389,7 @@ def adjoint_directions(
         dv (m, mN), dt (m, nN) and dλ (m, nN).
     """
     active = solution.active(qp)
+    # u_0 is the first of the variables.
     seeds = np.eye(n_actions, qp.f.size)
     unmoved_limits = np.zeros((n_actions, qp.w.size))
     dv, dlam = kkt_solve(qp, active, seeds, unmoved_limits)
@@ -421,6 +425,7 @@ def curvature_directions(
     horizon, width = step.shape
     n = rows.shape[0] // horizon
     m = width - n
+    # One unit of the scaled action's price, in the model's units.
     units = scale.action / scale.cost
     result = []
     for unit, row in zip(units, dv, strict=True):

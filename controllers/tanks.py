@@ -19,6 +19,7 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     # Torricelli's law; the least level keeps the root differentiable in an empty tank.
     level = ca.fmax(x, 1e-3)
     out = holes * ca.sqrt(2 * GRAVITY * level)
+    # Each pump feeds a lower tank and, crosswise, the upper one over the other lower tank.
     pump1 = k1 * u[0]
     pump2 = k2 * u[1]
     inflow = ca.vertcat(

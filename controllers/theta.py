@@ -137,6 +137,7 @@ class ThetaBlocks:
                 continue
             entries: Iterable[object] = block.labels or range(block.size)
             if block.symmetric:
+                # In the order of the packed entries.
                 rows, columns = upper_triangle(block.shape[0])
                 entries = [f"{i},{j}" for i, j in zip(rows, columns, strict=True)]
             for entry in entries:
@@ -182,6 +183,7 @@ class ThetaBlocks:
         kappa = units.cost
         states = units.state
         both = np.concatenate([states, units.action])
+        # Curvatures that make a cost of κ over a unit of each variable, slopes a tenth of it.
         state_hessian = kappa / np.outer(states, states)
         state_gradient = 0.1 * kappa / states
         hessian = kappa / np.outer(both, both)
@@ -201,6 +203,7 @@ class ThetaBlocks:
             _block("x_u", bound, "upper state bound"),
         ]
         if slack_weights:
+            # Below its least weights a penalty is not exact: the QP would rather violate a bound.
             quadratic = kappa / states**2
             blocks += [
                 _block(
@@ -238,6 +241,7 @@ def _block(
     least: ArrayLike = (),
 ) -> ThetaBlock:
     """A block of the shape of its scale, which is a scalar, a vector or a symmetric matrix."""
+    # Packed as θ has it.
     packed = scale.reshape(-1)
     if scale.ndim == 2:
         packed = scale[upper_triangle(len(scale))]

@@ -37,6 +37,7 @@ def gauss_rule(
         law: Law of the disturbances.
         counts: Number of nodes of each.
     """
+    # NumPy's rules are those of [−1, 1] and of e^(−x²/2); their weights do not sum to 1.
     axes = []
     weights = np.ones(1)
     for count, nominal, spread in zip(counts, law.nominal, law.ranges, strict=True):
@@ -169,6 +170,7 @@ class Elementwise:
         self._n_out = function.size1_out(0)
         self._out_rows = list(function.sparsity_out(0).row())
         self._program: list[Instruction] = []
+        # CasADi's own program, which is run on a work vector of arrays in place of numbers.
         evaluated = (ca.OP_INPUT, ca.OP_OUTPUT, *_OPERATIONS)
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
@@ -300,6 +302,7 @@ class BellmanOperator:
             grid: The grid.
             W: Smooth part of the value on the grid, (G,).
         """
+        # The coefficients of all cells, once for all slices.
         smooth = grid.interpolant(W)
 
         def values_of(part: slice) -> Array:
@@ -395,6 +398,7 @@ class BellmanOperator:
         linear = problem.penalty_linear[i]
         quadratic = problem.penalty_quadratic[i]
         excess = sign * (self._refine(x) - bound)
+        # `Penalty` of the scenario, for one bound.
         violation = np.maximum(excess, 0.0)
         penalty = (linear + quadratic * violation) * violation
         return _mean(penalty, self._penalty_weights)
@@ -403,6 +407,7 @@ class BellmanOperator:
         """Results of a task for slices of `count` states, by the threads where there are any."""
         entries = count * len(self._weights)
         n_tasks = min(-(-entries // ENTRIES_A_TASK), count)  # rounded up
+        # Parts of nearly equal size, which do not depend on the number of threads.
         edges = np.linspace(0, count, n_tasks + 1).astype(int)
         parts = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
         if self._pool is None:

@@ -85,6 +85,7 @@ def first_grid(
         features = []
         for x in (lower, reference, upper):
             features.append((x - spacing, x + spacing, spacing))
+        # Beyond the bounds, which are soft: the closed loop may violate them.
         first = lower - 0.1 * span
         last = upper + 0.1 * span
         marks = sorted({first, lower, reference, upper, last})
@@ -153,6 +154,7 @@ def refined(
 
 def _support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:
     """Interval that holds all but `tail` of the mass at each end, and a cell on either side."""
+    # A cell more on either side: the mass stands at points for what is between them.
     cumulative = np.cumsum(mass) / mass.sum()
     ends = np.searchsorted(cumulative, (tail, 1.0 - tail))
     first = max(ends[0] - 1, 0)
@@ -389,6 +391,7 @@ def objection(certificate: Sequence[GainEstimate]) -> str | None:
     # A search has a bound from above alone: what it finds may be dearer, not cheaper.
     search = estimates.pop(SEARCH, None)
     percent = 100 * CERTIFICATE_TOLERANCE
+    # The others have intervals on both sides: they must agree with each other.
     values = [estimate.value for estimate in estimates.values()]
     least = min(values)
     spread = (max(values) - least) / abs(least)
@@ -546,9 +549,11 @@ def simulate_policy(
     parameters = plant.parameters
     step = Elementwise(discretise(model, problem.sampling_time, optimum.accuracy.substeps))
     stage_cost = Elementwise(economic_cost(model))
+    # Without the smooth parts: linear, as the policy is applied.
     grid = Grid(optimum.grid.axes)
     policy = [grid.interpolant(column) for column in optimum.actions.T]
 
+    # The burn-in then only has to forget the grid.
     probabilities = optimum.distribution / optimum.distribution.sum()
     start = rng.choice(grid.size, paths, p=probabilities)
     # An array (paths,) for each state, action and disturbance.
@@ -599,6 +604,7 @@ def certify(
     """
     operator = BellmanOperator(plant, optimum.accuracy, workers=2)
     level = settings.level + 1
+    # At full accuracy from the start, since the solution is close by.
     start = refined(operator, optimum, settings, level)
     iterate = _iterate(operator, start, level, settings, progress)
     refinement = _accepted(iterate)

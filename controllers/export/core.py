@@ -251,6 +251,7 @@ def _filled(template: str, **values: str) -> str:
 
 
 def _array_text(name: str, values: ArrayLike) -> str:
+    # `repr` gives back the same double: a constant in C has no rounding of its own.
     array = np.asarray(values, dtype=np.float64)
     numbers = ", ".join(_number(value) for value in array)
     return f"static const double {name}[] = {{{numbers}}};"

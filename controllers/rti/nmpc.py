@@ -387,6 +387,7 @@ class _Batch:
         self.enforced = enforced
         self.theta = theta
         self.points = points
+        # A row that stays NaN has no solution.
         self.actions = np.full((count, m), np.nan)
         self.values = np.full(count, np.nan)
         self.slopes: Vector | None = None
@@ -459,6 +460,7 @@ class Engine:
     def __init__(self, path: str, functions: NmpcFunctions, stagewise: bool) -> None:
         self.stagewise = stagewise
         self._library = ctypes.CDLL(path)
+        # ctypes takes every result for an int, which is too short for these.
         self._library.engine_sizes.restype = ctypes.c_size_t
         self._library.engine_loop_size.restype = ctypes.c_size_t
         self._library.engine_run.restype = ctypes.c_longlong
@@ -747,6 +749,7 @@ class RtiNmpc:
         action_lower = self._scaled(problem.action_lower)
         action_upper = self._scaled(problem.action_upper)
         self._action_bounds = (action_lower, action_upper)
+        # The actions' bounds stay, but for those of u_0, which an enforced action replaces.
         self._qp.lower[:] = np.tile(action_lower, horizon)
         self._qp.upper[:] = np.tile(action_upper, horizon)
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)
@@ -847,6 +850,7 @@ class RtiNmpc:
         self._costates[:] = 0.0
         self._pending: RtiSolution | None = None
         self._prepared = None
+        # A backend may remember: a new one does not.
         self._backend = self._make_backend()
 
     def prepare(self) -> None:
@@ -1030,6 +1034,7 @@ class RtiNmpc:
             if self._engine is None:
                 finite = self._solve_interpreted(action)
             else:
+                # The status of a preparation that failed is that of the feedback.
                 status = self._solve_compiled(self._engine, action)
                 finite = status != NOT_FINITE
                 if status not in (0, NOT_FINITE):
@@ -1088,6 +1093,7 @@ class RtiNmpc:
         m = self.problem.n_actions
         self._embed()
         self._readout.inputs["constant"][0] = self._constant[0]
+        # The bounds of u_0 may still be an action that the last feedback enforced.
         lower, upper = self._action_bounds
         if a is not None:
             lower = upper = self._scaled(a)
@@ -1102,6 +1108,7 @@ class RtiNmpc:
         """Read a solution out, polished if need be; raises QpError where it is inaccurate."""
         residual = self._read(solution, enforced)
         if not residual <= ACCURATE_RESIDUAL:
+            # Most solutions are accurate at once and need no Newton step.
             residual = self._read(polish(self._qp, solution), enforced)
         if not residual <= SOLVED_RESIDUAL:
             raise QpError(
@@ -1145,6 +1152,7 @@ class RtiNmpc:
             of_problem = getattr(problem, name)
             if not np.array_equal(of_scenario, of_problem):
                 return None
+        # A plant may have more states than the model, which the loop in C does not pick.
         if len(scenario.plant.states) != problem.n_states:
             return None
         self.reset()

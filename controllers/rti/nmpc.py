@@ -752,6 +752,12 @@ class RtiNmpc:
         # The actions' bounds stay, but for those of u_0, which an enforced action replaces.
         self._qp.lower[:] = np.tile(action_lower, horizon)
         self._qp.upper[:] = np.tile(action_upper, horizon)
+        # The slack's weights in units of `Problem.scale`: a cost for each unit of a state, and of
+        # its square; and how much the rows of the stages 1 … N weigh, (Nn,).
+        scale = problem.scale
+        self._price = scale.state_price
+        self._quadratic_unit = scale.state / self._price
+        self._slack_discounts = np.repeat(problem.discounts[1:], problem.n_states)
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)
         self._x = prepare.part("x").reshape(horizon, -1)
         self._u = prepare.part("u").reshape(horizon, -1)
@@ -901,19 +907,14 @@ class RtiNmpc:
 
     def _weigh(self, w: Vector, W: Vector) -> None:
         """Give the slack of the predicted stages its weights (n,), discounted."""
-        problem = self.problem
-        horizon = problem.horizon
-        scale = problem.scale
-        price = scale.state_price
-        discounts = np.repeat(problem.discounts[1:], problem.n_states)
-        # In units of `Problem.scale`: a cost for each unit of a state, and of its square.
-        linear = w / price
-        quadratic = W * (scale.state / price)
+        horizon = self.problem.horizon
+        linear = w / self._price
+        quadratic = W * self._quadratic_unit
         # Make new views: a backend recognises new weights by them.
         self._qp.w = self._prepare.part("w")
         self._qp.W = self._prepare.part("W")
-        self._qp.w[:] = discounts * np.tile(linear, horizon)
-        self._qp.W[:] = discounts * np.tile(quadratic, horizon)
+        self._qp.w[:] = self._slack_discounts * np.tile(linear, horizon)
+        self._qp.W[:] = self._slack_discounts * np.tile(quadratic, horizon)
 
     def _scaled(self, action: Vector) -> Vector:
         """The QP's variables that stand for an action (m,)."""

@@ -47,6 +47,7 @@ class ConvergedNmpc(RtiNmpc):
         iterations: int = 100,
     ) -> None:
         self._tolerance = tolerance
+        # The steps of SQP, unlike those of `RtiNmpc`, all belong to one feedback.
         self._max_iterations = iterations
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
@@ -79,12 +80,15 @@ class ConvergedNmpc(RtiNmpc):
         for _ in range(self._max_iterations):
             # Full steps: the last QP's solution is the next point of linearisation.
             last = solution
+            # The next linearisation writes over the costates of this one.
             last_costates = self._costates.copy()
             self._linearise_at(solution.unshifted)
             solution = self._solve_qp(s, a)
             change = self._change(solution, last, last_costates)
             if change < self._tolerance:
-                return self._read_unlifted(a, solution) if self._hessian.lifts else solution
+                if self._hessian.lifts:
+                    return self._read_unlifted(a, solution)
+                return solution
         raise QpError(
             f"SQP did not converge in {self._max_iterations} iterations at "
             f"s = {solution.predicted_states[0]}; the last change was {change:.1e} of the ranges",
@@ -92,18 +96,23 @@ class ConvergedNmpc(RtiNmpc):
             qp=solution.qp.copy(),
         )
 
-    def _change(self, solution: RtiSolution, last: RtiSolution, last_costates: Matrix) -> float:
+    def _change(
+        self,
+        solution: RtiSolution,
+        last: RtiSolution,
+        last_costates: Matrix,
+    ) -> float:
         """Largest change of a step's solution, without a unit; see the class."""
         scale = self.problem.scale
-        states = (solution.predicted_states - last.predicted_states) / scale.state
-        actions = (solution.predicted_actions - last.predicted_actions) / scale.action
-        costates = (solution.costates[1:] - self._costates) / scale.state_price
+        d_states = solution.predicted_states - last.predicted_states
+        d_actions = solution.predicted_actions - last.predicted_actions
+        d_costates = solution.costates[1:] - self._costates
         # Costates may be large where the cost is: their change counts beside their size.
-        size = 1 + float(np.abs(last_costates / scale.state_price).max())
+        size = 1 + _largest(last_costates / scale.state_price)
         return max(
-            float(np.abs(states).max()),
-            float(np.abs(actions).max()),
-            float(np.abs(costates).max()) / size,
+            _largest(d_states / scale.state),
+            _largest(d_actions / scale.action),
+            _largest(d_costates / scale.state_price) / size,
         )
 
     def _read_unlifted(self, a: ArrayLike | None, solution: RtiSolution) -> RtiSolution:
@@ -113,12 +122,22 @@ class ConvergedNmpc(RtiNmpc):
         are those of the programme only with its own Hessian. A solver could not take that QP, and
         needs not: its solution is known.
         """
+        enforced = a is not None
+        action = None
+        if a is not None:
+            action = np.asarray(a, dtype=np.float64)
         try:
             self._hessian.lifts = False
-            self._x[:], self._u[:], self._costates[:] = solution.unshifted
+            self._set_point(solution.unshifted)
             self._make_qp()
-            self._embed_state(None if a is None else np.asarray(a, dtype=np.float64))
-            self._accept(solution.multipliers, enforced=a is not None)
-            return self._solution(self._keep_preparation(None), enforced=a is not None)
+            self._embed_state(action)
+            self._accept(solution.multipliers, enforced=enforced)
+            prepared = self._keep_preparation(None)
+            return self._solution(prepared, enforced=enforced)
         finally:
             self._linearise_as(lifts=True)
+
+
+def _largest(values: Matrix) -> float:
+    """Largest absolute value."""
+    return float(np.abs(values).max())

@@ -20,8 +20,10 @@ from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
 from cosim.core.protocols import Array
 
-# A bound counts as strictly active above this share of the largest multiplier.
-_STRICT = 1e-6
+FORCE_WEIGHT = 1e-3
+"""Price ρ of the force F at the active constraints, against the conditioning β."""
+STRICTLY_ACTIVE = 1e-6
+"""Share of the largest multiplier above which a bound counts as strictly active."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +66,31 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     u = ca.SX.sym("u", problem.n_actions)
     d = ca.DM(model.nominal_disturbance)
     p = ca.DM(model.nominal_parameters)
-    x_next = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
+    f = discretise(model, problem.sampling_time, problem.substeps)
+    x_next = f(x, u, d, p)
+    change = x_next - x
     cost = model.economic_cost(x, u, ca.SX(d), ca.SX(p))
     w = ca.vertcat(x, u)
     # Bounds are not relaxed: the active ones are read off the solution.
     options: dict[str, Any] = {
-        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-11, "bound_relax_factor": 0.0},
+        "ipopt": {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": 1e-11,
+            "bound_relax_factor": 0.0,
+        },
         "print_time": False,
         "error_on_fail": False,
     }
-    solver = ca.nlpsol("steady_state", "ipopt", {"x": w, "f": cost, "g": x_next - x}, options)
-    solution = solver(x0=problem.reference, lbx=problem.lower, ubx=problem.upper, lbg=0.0, ubg=0.0)
+    programme = {"x": w, "f": cost, "g": change}
+    solver = ca.nlpsol("steady_state", "ipopt", programme, options)
+    solution = solver(
+        x0=problem.reference,
+        lbx=problem.lower,
+        ubx=problem.upper,
+        lbg=0.0,
+        ubg=0.0,
+    )
     stats = solver.stats()
     if not stats["success"]:
         raise TuningError(
@@ -85,14 +101,18 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     # What is left of the gradient of cost and dynamics are the bounds' multipliers.
     point = solution["x"].full().reshape(-1)
     costate = solution["lam_g"].full().reshape(-1)
-    lagrangian = cost + ca.dot(ca.SX(ca.DM(costate)), x_next - x)
+    lagrangian = cost + ca.dot(ca.SX(ca.DM(costate)), change)
     hessian, gradient = ca.hessian(lagrangian, w)
-    derivatives = ca.Function("d", [w], [hessian, gradient, ca.jacobian(x_next, w)])
+    jacobian = ca.jacobian(x_next, w)
+    derivatives = ca.Function("d", [w], [hessian, gradient, jacobian])
     hessian, gradient, jacobian = (value.full() for value in derivatives(point))
     multipliers = gradient.reshape(-1)
-    least = _STRICT * max(1.0, np.abs(multipliers).max())
+
     # A bound that does not push takes no freedom from the feedback.
-    strict = np.flatnonzero(np.abs(multipliers) > least)
+    size = np.abs(multipliers)
+    least = STRICTLY_ACTIVE * max(1.0, size.max())
+    strict = np.flatnonzero(size > least)
+    active = [_active_bound(problem, i, multipliers[i]) for i in strict.tolist()]
     return SteadyState(
         x=point[:n],
         u=point[n:],
@@ -103,26 +123,32 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         B=jacobian[:, n:],
         hessian=hessian,
         C=np.eye(len(point))[strict],
-        active=tuple(_active_bound(problem, i, multipliers[i]) for i in strict.tolist()),
+        active=tuple(active),
     )
 
 
 def _active_bound(problem: Problem, i: int, multiplier: float) -> str:
     """The active bound of entry i of (x, u) in words; TuningError where it would be violated."""
     model = problem.model
-    quantity = (*model.states, *model.actions)[i]
-    if i < problem.n_states and abs(multiplier) >= problem.penalty_linear[i]:
+    quantities = (*model.states, *model.actions)
+    quantity = quantities[i]
+    size = abs(multiplier)
+    if i < problem.n_states and size >= problem.penalty_linear[i]:
         raise TuningError(
             f"the penalty of {quantity.name} is too small: its linear weight "
-            f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
-            f"{abs(multiplier):g}"
+            f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier {size:g}"
         )
     if multiplier > 0:
         return f"{quantity.name} ≥ {problem.lower[i]:g} {quantity.unit}".rstrip()
     return f"{quantity.name} ≤ {problem.upper[i]:g} {quantity.unit}".rstrip()
 
 
-def local_feedback(A: Array, B: Array, H: Array, C: Array) -> tuple[Array, Array]:
+def local_feedback(
+    A: Array,
+    B: Array,
+    H: Array,
+    C: Array,
+) -> tuple[Array, Array]:
     """Gain K of u = Kx and value P of min Σ ½ wᵀHw, w = (x, u), x₊ = Ax + Bu, γ = 1.
 
     It solves the Riccati equation on the manifold C w_k = 0, k ≥ 1, of the active constraints. A
@@ -141,37 +167,52 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> tuple[Array, Array
         TuningError: The actions cannot keep the constraints, or no stabilising solution exists.
     """
     n, m = B.shape
+    # What a state's constraint asks of the next state, as a constraint of (x, u).
     on_action = np.abs(C[:, n:]).max(axis=1, initial=0.0) > 0
-    rows = np.vstack([C[on_action], C[~on_action, :n] @ np.hstack([A, B])])
+    dynamics = np.hstack([A, B])
+    on_next_state = C[~on_action, :n] @ dynamics
+    rows = np.vstack([C[on_action], on_next_state])
+    by_state = rows[:, :n]
+    by_action = rows[:, n:]
+
     # Actions that keep the constraints: u = gain x + free v.
     gain = np.zeros((m, n))
     free = np.eye(m)
     if len(rows):
-        if np.linalg.matrix_rank(rows[:, n:]) < len(rows):
+        if np.linalg.matrix_rank(by_action) < len(rows):
             raise TuningError(
                 f"the {len(rows)} active constraints cannot all be kept by the {m} actions within "
                 "one sample: local feedback is not defined by them"
             )
-        gain = -np.linalg.pinv(rows[:, n:]) @ rows[:, :n]
-        free = null_space(rows[:, n:])
+        gain = -np.linalg.pinv(by_action) @ by_state
+        free = null_space(by_action)
     if free.shape[1]:
         gain = gain + free @ _unconstrained_feedback(A, B, H, gain, free)
 
-    closed = A + B @ gain
-    stage = np.vstack([np.eye(n), gain])
-    if np.abs(np.linalg.eigvals(closed)).max() >= 1:
+    closed_loop = A + B @ gain
+    eigenvalues = np.linalg.eigvals(closed_loop)
+    if np.abs(eigenvalues).max() >= 1:
         raise TuningError("the active constraints, once kept, make the closed loop unstable")
     # P = stage + closedᵀ P closed: the Riccati solver's P is accurate in the gain's part only.
-    P = solve_discrete_lyapunov(closed.T, stage.T @ H @ stage, method="direct")
+    along = np.vstack([np.eye(n), gain])
+    stage = along.T @ H @ along
+    P = solve_discrete_lyapunov(closed_loop.T, stage, method="direct")
     return gain, _symmetric(P)
 
 
-def _unconstrained_feedback(A: Array, B: Array, H: Array, gain: Array, free: Array) -> Array:
+def _unconstrained_feedback(
+    A: Array,
+    B: Array,
+    H: Array,
+    gain: Array,
+    free: Array,
+) -> Array:
     """Gain of v = Kx, where u = `gain` x + `free` v, by the Riccati equation of v."""
     n = len(A)
     count = free.shape[1]
     # In the free variables: (x, u) = change (x, v).
-    change = np.block([[np.eye(n), np.zeros((n, count))], [gain, free]])
+    state_rows = [np.eye(n), np.zeros((n, count))]
+    change = np.block([state_rows, [gain, free]])
     reduced = change.T @ H @ change
     a = A + B @ gain
     b = B @ free
@@ -185,9 +226,11 @@ def _unconstrained_feedback(A: Array, B: Array, H: Array, gain: Array, free: Arr
             f"the steady state has no stabilising local feedback of finite cost ({error})"
         ) from error
     curvature = r + b.T @ P @ b
-    if np.linalg.eigvalsh(_symmetric(curvature)).min() <= 0:
+    eigenvalues = np.linalg.eigvalsh(_symmetric(curvature))
+    if eigenvalues.min() <= 0:
         raise TuningError("the steady state is no local minimum of the economic cost")
-    solution: Array = -np.linalg.solve(curvature, b.T @ P @ a + s.T)
+    cross = b.T @ P @ a + s.T
+    solution: Array = -np.linalg.solve(curvature, cross)
     return solution
 
 
@@ -214,16 +257,22 @@ def rotation(A: Array, B: Array, delta_P: Array) -> Array:
         B: Jacobian by the action, (n, m).
         delta_P: Matrix of the storage, (n, n).
     """
+    n = len(A)
     dynamics = np.hstack([A, B])
     rotated: Array = dynamics.T @ delta_P @ dynamics
-    rotated[: len(A), : len(A)] -= delta_P
+    rotated[:n, :n] -= delta_P
     return rotated
 
 
-def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> Convexification:
+def convexify(
+    A: Array,
+    B: Array,
+    H: Array,
+    C: Array,
+) -> Convexification:
     """Best-conditioned convex stage cost with the same local optimum.
 
-    min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F
+    With ρ = `FORCE_WEIGHT`, min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F
     (Zanon, Gros, Diehl 2016). 𝓗(δP) telescopes along a trajectory and CᵀFC vanishes where C w = 0,
     so neither changes the optimal feedback.
 
@@ -232,7 +281,6 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
         B: Jacobian by the action, (n, m).
         H: Hessian of the stage cost, (n+m, n+m).
         C: Gradients of the active constraints, (n_c, n+m).
-        weight: ρ.
 
     Raises:
         TuningError: There is no solution: the steady state is not locally optimal under these
@@ -241,36 +289,45 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     size = len(H)
     n = len(A)
     n_c = len(C)
-    rotations = [rotation(A, B, unit) for unit in _symmetric_basis(n)]
-    forces = [C.T @ unit @ C for unit in _symmetric_basis(n_c)]
+    F_basis = _symmetric_basis(n_c)
+    n_F = len(F_basis)
+
     # The convexified Hessian is linear in α, δP and F: a column each.
     # In `svec` the cone of positive semidefinite matrices is Clarabel's.
-    columns = np.stack([svec(matrix) for matrix in (H, *rotations, *forces)], axis=1)
+    rotations = [rotation(A, B, unit) for unit in _symmetric_basis(n)]
+    forces = [C.T @ unit @ C for unit in F_basis]
+    terms = [H, *rotations, *forces]
+    columns = np.stack([svec(term) for term in terms], axis=1)
     triangle, count = columns.shape
     identity = svec(np.eye(size))[:, None]
     zeros = np.zeros((triangle, 1))
 
     # Variables: α, δP, F, β, t with t ≥ ‖F‖.
-    n_F = n_c * (n_c + 1) // 2
-    nonnegative = np.zeros((1, count + 2))
+    n_variables = count + 2
+    F_place = slice(count - n_F, count)
+    objective = np.zeros(n_variables)
+    objective[-2] = 1.0
+    objective[-1] = FORCE_WEIGHT
+    quadratic = np.zeros((n_variables, n_variables))
+
+    # α ≥ 0, (t, F) in the second-order cone, Hessian − I ⪰ 0, βI − Hessian ⪰ 0.
+    nonnegative = np.zeros((1, n_variables))
     nonnegative[0, 0] = -1.0
-    norm = np.zeros((1 + n_F, count + 2))
+    norms = [np.linalg.norm(unit) for unit in F_basis]
+    norm = np.zeros((1 + n_F, n_variables))
     norm[0, -1] = -1.0
-    norm[1:, count - n_F : count] = -np.diag([np.linalg.norm(e) for e in _symmetric_basis(n_c)])
+    norm[1:, F_place] = -np.diag(norms)
     above_identity = np.hstack([-columns, zeros, zeros])
     below_beta = np.hstack([columns, -identity, zeros])
     constraints = np.vstack([nonnegative, norm, above_identity, below_beta])
-    offset = np.concatenate([np.zeros(2 + n_F), -identity[:, 0], np.zeros(triangle)])
+    no_offset = np.zeros(2 + n_F)
+    offset = np.concatenate([no_offset, -identity[:, 0], np.zeros(triangle)])
     cones = [
         clarabel.NonnegativeConeT(1),
         clarabel.SecondOrderConeT(1 + n_F),
         clarabel.PSDTriangleConeT(size),
         clarabel.PSDTriangleConeT(size),
     ]
-    objective = np.zeros(count + 2)
-    objective[-2] = 1.0
-    objective[-1] = weight
-    quadratic = np.zeros((count + 2, count + 2))
     z, status = solve_conic(quadratic, objective, constraints, offset, cones, iterations=500)
     if z is None or not z[0] > 0:
         constraint = "constraint" if n_c == 1 else "constraints"
@@ -280,8 +337,9 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
         )
 
     alpha = float(z[0])
-    delta_P = symmetric_matrix(z[1 : count - n_F], n) / alpha
-    F = symmetric_matrix(z[count - n_F : count], n_c) / alpha
+    beta = float(z[-2])
+    delta_P = symmetric_matrix(z[1 : F_place.start], n) / alpha
+    F = symmetric_matrix(z[F_place], n_c) / alpha
     hessian = _symmetric(H + rotation(A, B, delta_P) + C.T @ F @ C)
     least = np.linalg.eigvalsh(hessian)[0]
     if not least > 0:
@@ -289,12 +347,13 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
             f"the convexified cost is not positive definite (smallest eigenvalue {least:.3g}, "
             f"Clarabel: {status})"
         )
-    return Convexification(hessian, delta_P, F, alpha, float(z[-2]))
+    return Convexification(hessian, delta_P, F, alpha, beta)
 
 
 def _symmetric_basis(size: int) -> list[Array]:
     """Basis of the symmetric matrices: e_ij + e_ji, upper triangle row by row."""
-    return [symmetric_matrix(unit, size) for unit in np.eye(size * (size + 1) // 2)]
+    n_entries = size * (size + 1) // 2
+    return [symmetric_matrix(unit, size) for unit in np.eye(n_entries)]
 
 
 @dataclass(frozen=True)
@@ -314,13 +373,15 @@ class EconomicTuning:
     @property
     def gain_error(self) -> float:
         """Largest difference between the tuned local feedback gain and the economic one."""
-        return float(np.abs(self.tuned - self.economic).max())
+        difference = np.abs(self.tuned - self.economic)
+        return float(difference.max())
 
     def __str__(self) -> str:
         steady = self.steady_state
         convex = self.convexification
         active = []
-        for name, multiplier in zip(steady.active, steady.C @ steady.multipliers, strict=True):
+        active_multipliers = steady.C @ steady.multipliers
+        for name, multiplier in zip(steady.active, active_multipliers, strict=True):
             active.append(f"{name} (multiplier {multiplier:.4g})")
         economic = _five_digits(np.linalg.eigvalsh(steady.hessian))
         convexified = _five_digits(np.linalg.eigvalsh(convex.hessian))
@@ -353,16 +414,18 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     Raises:
         TuningError: Steady state, local optimum or convexification do not exist.
     """
+    # The certificate compares gains, which need A and B to more digits than a controller does.
     substeps = linearisation_substeps(problem)
     steady = optimal_steady_state(dataclasses.replace(problem, substeps=substeps))
     n = problem.n_states
     A = steady.A
     B = steady.B
+    C = steady.C
     try:
         # The economic cost's feedback is what the tuned one must equal: the certificate.
-        economic, _ = local_feedback(A, B, steady.hessian, steady.C)
-        convex = convexify(A, B, steady.hessian, steady.C, 1e-3)
-        tuned, P = local_feedback(A, B, convex.hessian, steady.C)
+        economic, _ = local_feedback(A, B, steady.hessian, C)
+        convex = convexify(A, B, steady.hessian, C)
+        tuned, P = local_feedback(A, B, convex.hessian, C)
     except TuningError as error:
         raise TuningError(
             f"{error}. {steady}. Change the bounds so that the cost has a minimum with other "
@@ -371,17 +434,22 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     dynamics = np.hstack([A, B])
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
     q = steady.multipliers
-    C_x = steady.C[:, :n]
-    # θ's quadratics are about the reference, the tuning's about the optimal steady state.
-    shift = problem.reference - np.concatenate([steady.x, steady.u])
+    q_x = q[:n]
+    C_x = C[:, :n]
+    # The storage, less what F costs at stage 0, whose state need not keep the constraints.
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
+
+    # θ's quadratics are about the reference, the tuning's about the optimal steady state.
+    steady_point = np.concatenate([steady.x, steady.u])
+    shift = problem.reference - steady_point
+    shift_x = shift[:n]
     values = {
         "B_l": _symmetric(0.5 * M),
         "b_l": q + M @ shift,
         "B_Vf": _symmetric(0.5 * P),
-        "b_Vf": q[:n] + P @ shift[:n],
+        "b_Vf": q_x + P @ shift_x,
         "B_lambda": _symmetric(0.5 * initial),
-        "b_lambda": steady.costate + initial @ shift[:n],
+        "b_lambda": steady.costate + initial @ shift_x,
     }
     rounded = {name: _rounded(value) for name, value in values.items()}
     parameters = Parameters.naive(problem, blocks).replace(rounded)
@@ -400,19 +468,21 @@ def linearisation_substeps(problem: Problem) -> int:
     x, u, d, p = model.symbols()
     h = ca.SX.sym("h")
     after = runge_kutta(lambda state: model.ode(state, u, d, p), x, h, 1)
-    step = ca.Function("step", [x, u, d, p, h], [after, ca.jacobian(after, ca.vertcat(x, u))])
-    nominal = model.nominal_disturbance, model.nominal_parameters
+    by_point = ca.jacobian(after, ca.vertcat(x, u))
+    step = ca.Function("step", [x, u, d, p, h], [after, by_point])
+    state, *held = problem.nominal_point
     length = problem.sampling_time / model.time_unit
 
     def linear(substeps: int) -> Array:
         """A and B side by side."""
-        state = problem.reference_state
+        present = state
         jacobian = np.eye(n, n + m)
-        actions = np.eye(m, n + m, n)
+        # The action is held: its own derivative stays (0, I).
+        held_jacobian = np.eye(m, n + m, n)
         for _ in range(substeps):
-            results = step(state, problem.reference_action, *nominal, length / substeps)
-            state, slope = (part.full() for part in results)
-            jacobian = slope @ np.vstack([jacobian, actions])
+            results = step(present, *held, length / substeps)
+            present, slope = (part.full() for part in results)
+            jacobian = slope @ np.vstack([jacobian, held_jacobian])
         return jacobian
 
     substeps = problem.substeps
@@ -420,7 +490,9 @@ def linearisation_substeps(problem: Problem) -> int:
     while substeps <= 1024:
         # Doubling shows the error of the coarser one: that of the finer is a sixteenth.
         finer = linear(2 * substeps)
-        if (np.abs(finer - present) <= 1e-8 * (1.0 + np.abs(present))).all():
+        allowed = 1e-8 * (1.0 + np.abs(present))
+        change = np.abs(finer - present)
+        if (change <= allowed).all():
             return substeps
         substeps = 2 * substeps
         present = finer
@@ -435,27 +507,31 @@ def linear_model(problem: Problem) -> tuple[Array, Array]:
     n = problem.n_states
     model = problem.model
     x, u, d, p = model.symbols()
-    following = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
-    jacobian = ca.Function("AB", [x, u, d, p], [ca.jacobian(following, ca.vertcat(x, u))])
-    both = jacobian(
-        problem.reference_state,
-        problem.reference_action,
-        model.nominal_disturbance,
-        model.nominal_parameters,
-    ).full()
-    return both[:, :n], both[:, n:]
+    f = discretise(model, problem.sampling_time, problem.substeps)
+    x_next = f(x, u, d, p)
+    by_point = ca.jacobian(x_next, ca.vertcat(x, u))
+    jacobian = ca.Function("AB", [x, u, d, p], [by_point])
+    both = jacobian(*problem.nominal_point).full()
+    A = both[:, :n]
+    B = both[:, n:]
+    return A, B
 
 
 def _rounded(block: Array) -> Array:
     """Entries to six digits, 0 below 1e-9 of the largest, without a solver's last bits."""
     # The last bits are the solver's and differ between platforms; θ files must not.
     least = 1e-9 * float(np.abs(block).max(initial=0.0))
-    kept = [float(f"{x:.6g}") if abs(x) > least else 0.0 for x in block.flat]
-    return np.array(kept).reshape(block.shape)
+    rounded = np.zeros(block.shape)
+    for place, x in np.ndenumerate(block):
+        if abs(x) > least:
+            rounded[place] = float(f"{x:.6g}")
+    return rounded
 
 
 def _symmetric(matrix: NDArray[np.floating[Any]]) -> Array:
-    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)
+    """The symmetric part of a matrix that is symmetric but for rounding."""
+    part = 0.5 * (matrix + matrix.T)
+    return np.asarray(part, dtype=np.float64)
 
 
 def _five_digits(array: NDArray[np.floating[Any]]) -> str:
@@ -467,7 +543,13 @@ def _five_digits(array: NDArray[np.floating[Any]]) -> str:
 
 
 def solve_conic(
-    P: Array, q: Array, A: Array, b: Array, cones: Sequence[Any], *, iterations: int = 200
+    P: Array,
+    q: Array,
+    A: Array,
+    b: Array,
+    cones: Sequence[Any],
+    *,
+    iterations: int = 200,
 ) -> tuple[Array | None, str]:
     """Solve min ½xᵀPx + qᵀx s.t. b − Ax in the product of Clarabel's `cones`.
 
@@ -503,8 +585,9 @@ def solve_conic(
 
 def svec(matrix: Array) -> Array:
     """Vector of a symmetric matrix with its inner product: `svec_order` of its upper triangle."""
-    order, weight = svec_order(len(matrix))
-    packed: Array = matrix[np.triu_indices(len(matrix))]
+    dimension = len(matrix)
+    order, weight = svec_order(dimension)
+    packed: Array = matrix[np.triu_indices(dimension)]
     return weight * packed[order]
 
 
@@ -515,4 +598,7 @@ def svec_order(dimension: int) -> tuple[NDArray[np.intp], Array]:
     """
     rows, columns = np.triu_indices(dimension)
     order = np.lexsort((rows, columns))
-    return order, np.where(rows == columns, 1.0, np.sqrt(2.0))[order]
+    # √2 makes the vectors' inner product that of the matrices.
+    on_diagonal = rows == columns
+    weight = np.where(on_diagonal, 1.0, np.sqrt(2.0))
+    return order, weight[order]

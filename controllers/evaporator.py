@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import casadi as ca
 
-from controllers.model import Model, Quantity
+from controllers.model import Model, Quantity, by_name
 
-STATES = (Quantity("X2", "%", 25.0), Quantity("P2", "kPa", 49.74297))
-ACTIONS = (Quantity("P100", "kPa", 191.71322), Quantity("F200", "kg/min", 215.88844))
+STATES = (
+    Quantity("X2", "%", 25.0),
+    Quantity("P2", "kPa", 49.74297),
+)
+ACTIONS = (
+    Quantity("P100", "kPa", 191.71322),
+    Quantity("F200", "kg/min", 215.88844),
+)
 DISTURBANCES = (
     Quantity("X1", "%", 5.0),
     Quantity("F1", "kg/min", 10.0),
@@ -33,43 +41,63 @@ PARAMETER_VALUES = (
 )
 
 
-def _flows(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Product F2, vapour F4, condensate F5 and steam F100 in kg/min."""
+class Flows(NamedTuple):
+    """Product, vapour, condensate and steam in kg/min."""
+
+    F2: ca.SX
+    F4: ca.SX
+    F5: ca.SX
+    F100: ca.SX
+
+
+def _flows(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> Flows:
+    """The flows of paper.tex, Simulations, at a state, action, disturbance w and parameters p."""
     X2, P2 = ca.vertsplit(x)
     P100, F200 = ca.vertsplit(u)
-    _, F1, T1, T200 = ca.vertsplit(w)
-    a, b, c, d, e, f, g, h, _, _, UA2, Cp, lambda_, lambda_s, F3 = ca.vertsplit(p)
-    # Temperatures of the liquid, of the vapour and of the steam.
-    T2 = a * P2 + b * X2 + c
-    T3 = d * P2 + e
-    T100 = f * P100 + g
-    # Duties of the heater and of the condenser.
-    UA1 = h * (F1 + F3)
-    Q100 = UA1 * (T100 - T2)
-    Q200 = UA2 * (T3 - T200) / (1 + UA2 / (2 * Cp * F200))
+    disturbance = by_name(DISTURBANCES, w)
+    F1 = disturbance["F1"]
+    T1 = disturbance["T1"]
+    T200 = disturbance["T200"]
+    k = by_name(PARAMETER_VALUES, p)
+    UA2 = k["UA2"]
+    Cp = k["Cp"]
 
-    F4 = (Q100 - F1 * Cp * (T2 - T1)) / lambda_
-    F5 = Q200 / lambda_
-    F100 = Q100 / lambda_s
-    return F1 - F4, F4, F5, F100
+    # Temperatures of the liquid, of the vapour and of the steam in °C.
+    T2 = k["a"] * P2 + k["b"] * X2 + k["c"]
+    T3 = k["d"] * P2 + k["e"]
+    T100 = k["f"] * P100 + k["g"]
+
+    # Duties of the heater and of the condenser in kW; the feed is warmed up first.
+    UA1 = k["h"] * (F1 + k["F3"])
+    Q100 = UA1 * (T100 - T2)
+    resistance = 1 + UA2 / (2 * Cp * F200)
+    Q200 = UA2 * (T3 - T200) / resistance
+    warming = F1 * Cp * (T2 - T1)
+
+    F4 = (Q100 - warming) / k["lambda_"]
+    F5 = Q200 / k["lambda_"]
+    F100 = Q100 / k["lambda_s"]
+    return Flows(F1 - F4, F4, F5, F100)
 
 
 def _ode(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     """Rates of X2 and P2: M X2' = F1 X1 − F2 X2 and C P2' = F4 − F5."""
     X2 = x[0]
-    X1, F1, _, _ = ca.vertsplit(w)
-    M = p[8]
-    C = p[9]
-    F2, F4, F5, _ = _flows(x, u, w, p)
-    return ca.vertcat((F1 * X1 - F2 * X2) / M, (F4 - F5) / C)
+    disturbance = by_name(DISTURBANCES, w)
+    k = by_name(PARAMETER_VALUES, p)
+    flows = _flows(x, u, w, p)
+    # Balances of the solute in the liquid, and of the vapour.
+    solute = disturbance["F1"] * disturbance["X1"] - flows.F2 * X2
+    vapour = flows.F4 - flows.F5
+    return ca.vertcat(solute / k["M"], vapour / k["C"])
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
-    """Cost 10.09 (F2 + F3) + 600 F100 + 0.6 F200 per minute."""
+    """Cost 10.09 (F2 + F3) + 600 F100 + 0.6 F200 per minute: pumping, steam, cooling water."""
     F200 = u[1]
-    F3 = p[14]
-    F2, _, _, F100 = _flows(x, u, w, p)
-    return 10.09 * (F2 + F3) + 600 * F100 + 0.6 * F200
+    F3 = by_name(PARAMETER_VALUES, p)["F3"]
+    flows = _flows(x, u, w, p)
+    return 10.09 * (flows.F2 + F3) + 600 * flows.F100 + 0.6 * F200
 
 
 def model() -> Model:

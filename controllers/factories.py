@@ -22,7 +22,11 @@ if TYPE_CHECKING:
 # Imported where it is needed: who simulates an RTI-NMPC shall not pay for SciPy and Clarabel.
 
 
-def nmpc(scenario: Scenario, parameters: Parameters, kind: str = "rti") -> RtiNmpc:
+def nmpc(
+    scenario: Scenario,
+    parameters: Parameters,
+    kind: str = "rti",
+) -> RtiNmpc:
     """NMPC for a scenario with given θ; the RTI-NMPC solves as many QPs a sample as that says.
 
     Args:
@@ -36,6 +40,7 @@ def nmpc(scenario: Scenario, parameters: Parameters, kind: str = "rti") -> RtiNm
     problem = Problem.from_scenario(scenario)
     settings = scenario.controller
     if kind == "converged":
+        # Its Hessian is the exact one, and it iterates to convergence: it has no use for the rest.
         return ConvergedNmpc(problem, parameters, backend=settings.backend)
     if kind != "rti":
         raise ControllerError(f"there is no NMPC '{kind}'; there are rti and converged")
@@ -55,8 +60,9 @@ def value_offset(scenario: Scenario, problem: Problem) -> float:
         scenario: The scenario.
         problem: Its problem.
     """
-    discounted = scenario.controller.value_offset == "discounted"
-    return problem.value_level() if discounted else problem.reference_cost
+    if scenario.controller.value_offset == "discounted":
+        return problem.value_level()
+    return problem.reference_cost
 
 
 def naive(scenario: Scenario, kind: str = "rti") -> RtiNmpc:
@@ -68,11 +74,16 @@ def naive(scenario: Scenario, kind: str = "rti") -> RtiNmpc:
     """
     problem = Problem.from_scenario(scenario)
     parameters = Parameters.naive(problem)
-    parameters = parameters.replace({"c_lambda": value_offset(scenario, problem)})
-    return nmpc(scenario, parameters, kind)
+    offset = value_offset(scenario, problem)
+    return nmpc(scenario, parameters.replace({"c_lambda": offset}), kind)
 
 
-def from_toml(scenario: Scenario, text: str, path: str | Path, kind: str = "rti") -> RtiNmpc:
+def from_toml(
+    scenario: Scenario,
+    text: str,
+    path: str | Path,
+    kind: str = "rti",
+) -> RtiNmpc:
     """NMPC with θ from the text of a θ file.
 
     Args:
@@ -81,7 +92,8 @@ def from_toml(scenario: Scenario, text: str, path: str | Path, kind: str = "rti"
         path: What the file is called in messages.
         kind: `rti` or `converged`.
     """
-    parameters = Parameters.from_toml(text, Problem.from_scenario(scenario), path)
+    problem = Problem.from_scenario(scenario)
+    parameters = Parameters.from_toml(text, problem, path)
     return nmpc(scenario, parameters, kind)
 
 
@@ -91,8 +103,8 @@ def tuned(scenario: Scenario) -> RtiNmpc:
 
     problem = Problem.from_scenario(scenario)
     parameters = tune(problem).parameters
-    parameters = parameters.replace({"c_lambda": value_offset(scenario, problem)})
-    return nmpc(scenario, parameters)
+    offset = value_offset(scenario, problem)
+    return nmpc(scenario, parameters.replace({"c_lambda": offset}))
 
 
 def lqr(scenario: Scenario) -> Lqr:
@@ -121,5 +133,6 @@ def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
     """
     from controllers.optimum import OptimalPolicy, QuasiStaticPolicy, change_of  # noqa: PLC0415
 
-    kind = OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy
-    return kind.from_scenario(scenario)
+    if change_of(scenario) is None:
+        return OptimalPolicy.from_scenario(scenario)
+    return QuasiStaticPolicy.from_scenario(scenario)

@@ -68,14 +68,17 @@ class StackedFunction:
         memory: Vector | None = None,
     ) -> None:
         # Dense, so that every result has a fixed place; common subexpressions are computed once.
-        self.function = function = ca.Function(
+        stacked = ca.veccat(*results.values())
+        self.function = ca.Function(
             name,
             [ca.densify(argument) for argument in arguments.values()],
-            [ca.densify(ca.veccat(*results.values()))],
+            [ca.densify(stacked)],
             list(arguments),
             ["stack"],
             {"cse": True},
         )
+
+        # The memory: inputs of its own, the results one after the other, room for the caller.
         shared = shared or {}
         sizes = {}
         for input_name, argument in arguments.items():
@@ -83,29 +86,34 @@ class StackedFunction:
                 _check_array(input_name, shared[input_name], argument.numel())
             else:
                 sizes[input_name] = argument.numel()
-        sizes["stack"] = function.numel_out(0)
+        sizes["stack"] = self.function.numel_out(0)
         sizes |= dict(room or {})
         total = sum(sizes.values())
-        self.memory: Vector = np.zeros(total) if memory is None else memory
-        _check_array("memory", self.memory, total)
+        if memory is None:
+            memory = np.zeros(total)
+        _check_array("memory", memory, total)
+        self.memory: Vector = memory
+
+        # Names of its parts; a result has a place in the memory and one in the stack.
         self.places = consecutive(sizes)
+        result_sizes = {key: result.numel() for key, result in results.items()}
+        self.slices = consecutive(result_sizes)
+        self.shapes = {key: result.shape for key, result in results.items()}
         self.inputs: dict[str, Vector] = {}
         for input_name in arguments:
             if input_name in shared:
                 self.inputs[input_name] = shared[input_name]
             else:
-                self.inputs[input_name] = self.memory[self.places[input_name]]
-        self.stack: Vector = self.memory[self.places["stack"]]
+                self.inputs[input_name] = memory[self.places[input_name]]
+        stack = self.places["stack"]
+        self.stack: Vector = memory[stack]
+        self.places |= consecutive(result_sizes, stack.start)
 
         # CasADi keeps pointers: the arrays must stay where they are.
-        self._buffer, self._evaluate = function.buffer()
+        self._buffer, self._evaluate = self.function.buffer()
         for i, array in enumerate(self.inputs.values()):
             self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]
         self._buffer.set_res(0, memoryview(self.stack))  # type: ignore[arg-type,call-arg]
-        result_sizes = {key: result.numel() for key, result in results.items()}
-        self.slices = consecutive(result_sizes)
-        self.places |= consecutive(result_sizes, self.places["stack"].start)
-        self.shapes = {key: result.shape for key, result in results.items()}
 
     def __call__(self) -> None:
         """Evaluate at `inputs`, into `stack`; NaN where a solver inside the function fails."""
@@ -143,7 +151,8 @@ class StackedFunction:
 
 def _check_array(name: str, array: Vector, size: int) -> None:
     """CasADi reads and writes raw memory: a wrong array would be a wrong number or a crash."""
-    if array.shape != (size,) or array.dtype != np.float64 or not array.flags.c_contiguous:
+    doubles = array.dtype == np.float64 and array.flags.c_contiguous
+    if array.shape != (size,) or not doubles:
         raise ValueError(f"{name} must be {size} doubles in a row, not {array.dtype} {array.shape}")
 
 
@@ -168,9 +177,11 @@ def not_in_c(functions: Sequence[ca.Function]) -> str | None:
     interpreter evaluates them.
     """
     for function in functions:
-        for part in [function, *function.find_functions()]:
-            if part.class_name() not in IN_C:
-                return f"the model calls '{part.name()}', a {part.class_name()} of CasADi"
+        parts = [function, *function.find_functions()]
+        for part in parts:
+            kind = part.class_name()
+            if kind not in IN_C:
+                return f"the model calls '{part.name()}', a {kind} of CasADi"
     return None
 
 
@@ -250,6 +261,7 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
     """
     if switch() == "never":
         return None
+    # A library is named by a digest of its files, which is taken of bytes.
     files = {}
     for name, source in sources.items():
         files[name] = source.encode() if isinstance(source, str) else source
@@ -279,13 +291,21 @@ def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
         files: C files by name.
         system: Platform, architecture and, for what is compiled here, compiler and flags.
     """
-    content = hashlib.sha256("\0".join(system).encode())
+    digest = hashlib.sha256("\0".join(system).encode())
     for name in sorted(files):
-        content.update(f"\0{name}\0{len(files[name])}\0".encode() + files[name])
-    return content.hexdigest()[:32]
+        # With its length, so that no file can be taken for the end of another.
+        content = files[name]
+        digest.update(f"\0{name}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()[:32]
 
 
-def _make(path: Path, files: Mapping[str, bytes], compiler: str | None, stored: str) -> None:
+def _make(
+    path: Path,
+    files: Mapping[str, bytes],
+    compiler: str | None,
+    stored: str,
+) -> None:
     """Take a library from `BUILDS`, else compile it; no file where neither can be."""
     with lock(path.with_suffix(".lock"), PATIENCE):
         if path.is_file():
@@ -304,6 +324,7 @@ def _make(path: Path, files: Mapping[str, bytes], compiler: str | None, stored: 
 def _stored_build(name: str) -> bytes | None:
     """Content of a library of `BUILDS`; None where it is not there."""
     try:
+        # An installation may lack the builds: then what is needed is compiled.
         with tarfile.open(BUILDS) as builds:
             build = builds.extractfile(name)
             assert build is not None, "only files are in it"
@@ -313,16 +334,19 @@ def _stored_build(name: str) -> bytes | None:
 
 
 def _compiled(compiler: str, files: Mapping[str, bytes], folder: Path) -> bool:
+    """Compile the files to `library` in a folder; whether it is there."""
     for name, content in files.items():
         (folder / name).write_bytes(content)
+    # The other files are headers, which the units include.
     units = sorted(name for name in files if name.endswith(".c"))
     command = [compiler, *FLAGS, "-o", "library", *units, "-lm"]
     try:
         # A compiler that hangs must not hang the run: without a library the interpreter does.
         with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
-            return child.wait(PATIENCE) == 0 and (folder / "library").is_file()
+            status = child.wait(PATIENCE)
     except (OSError, subprocess.SubprocessError):
         return False
+    return status == 0 and (folder / "library").is_file()
 
 
 def switch() -> str:
@@ -335,12 +359,18 @@ def switch() -> str:
 
 def find_compiler() -> str | None:
     """Path of the C compiler: CC, else the first of cc, gcc and clang, else None."""
-    names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
-    found = next(filter(None, map(shutil.which, names)), None)
-    if found and sys.platform == "darwin":  # its `cc` may only ask the user to install a compiler
-        answer = subprocess.run(["xcode-select", "-p"], capture_output=True, check=False)
-        return found if answer.returncode == 0 else None
-    return found
+    names = ["cc", "gcc", "clang"]
+    chosen = os.environ.get("CC")
+    if chosen:
+        names = [chosen]
+    paths = [path for path in map(shutil.which, names) if path is not None]
+    if not paths:
+        return None
+    if sys.platform == "darwin":  # its `cc` may only ask the user to install a compiler
+        tools = subprocess.run(["xcode-select", "-p"], capture_output=True, check=False)
+        if tools.returncode != 0:
+            return None
+    return paths[0]
 
 
 def description() -> str:

@@ -66,8 +66,12 @@ class _Predictor:
         model = problem.model
         x, u, d, p = model.symbols()
         rate = model.ode(x, u, d, p)
-        slope = ca.jacobian(rate, ca.vertcat(x, u))
-        rates = ca.Function("rates", [x, u, d, p], [ca.densify(rate), ca.densify(ca.vec(slope))])
+        slope = ca.vec(ca.jacobian(rate, ca.vertcat(x, u)))
+        rates = ca.Function(
+            "rates",
+            [x, u, d, p],
+            [ca.densify(rate), ca.densify(slope)],
+        )
         nominal_d = ca.SX(ca.DM(model.nominal_disturbance))
         nominal_p = ca.SX(ca.DM(model.nominal_parameters))
         at_nominal: Any = rates(x, u, nominal_d, nominal_p)
@@ -84,9 +88,11 @@ class _Predictor:
         Returns:
             The rates (P, n), and the derivatives (P, n, n+m).
         """
+        count, n = x.shape
         rates, slopes = (value.full().T for value in self._rates(x.T, u.T))
-        n = x.shape[1]
-        return rates, slopes.reshape(len(x), -1, n).transpose(0, 2, 1)
+        # CasADi stacks a derivative's columns.
+        by_columns = slopes.reshape(count, -1, n)
+        return rates, by_columns.transpose(0, 2, 1)
 
     def modes(self, x: Matrix, u: Matrix) -> NDArray[np.complex128]:
         """Eigenvalues (P, n) of the rates' derivatives by x; 0 where these are not finite.
@@ -95,17 +101,20 @@ class _Predictor:
             x: States, (P, n).
             u: Actions, (P, m).
         """
+        n = x.shape[1]
         _, slopes = self.slopes(x, u)
+        by_state = slopes[:, :, :n]
         # An eigenvalue solver raises its own error on what is not finite.
-        by_state = slopes[:, :, : x.shape[1]]
         finite: Mask = np.array(np.isfinite(by_state).all(axis=(1, 2)))
-        return np.linalg.eigvals(np.where(finite[:, None, None], by_state, 0.0)).astype(complex)
+        usable = np.where(finite[:, None, None], by_state, 0.0)
+        return np.linalg.eigvals(usable).astype(complex)
 
     def __call__(self, x: Matrix, u: Matrix, substeps: int) -> Matrix:
         """x₊ and its derivatives by (x, u) side by side, (P, n, 1+n+m)."""
         count, n = x.shape
         m = u.shape[1]
-        by_action = np.hstack([np.zeros((m, n)), np.eye(m)])
+        # The action is held: its own derivative by (x, u) is (0, I).
+        held_jacobian = np.hstack([np.zeros((m, n)), np.eye(m)])
         # A state and its derivatives side by side, which the variational equation carries on.
         state = np.zeros((count, n, 1 + n + m))
         state[:, :, 0] = x
@@ -113,8 +122,12 @@ class _Predictor:
         h = self.length / substeps
 
         def rate(state: Matrix) -> Matrix:
-            value, slope = self.slopes(state[:, :, 0], u)
-            variation = slope[:, :, :n] @ state[:, :, 1:] + slope[:, :, n:] @ by_action
+            present_x = state[:, :, 0]
+            jacobian = state[:, :, 1:]
+            value, slope = self.slopes(present_x, u)
+            by_state = slope[:, :, :n]
+            by_action = slope[:, :, n:]
+            variation = by_state @ jacobian + by_action @ held_jacobian
             return np.concatenate([value[:, :, None], variation], axis=2)
 
         for _ in range(substeps):
@@ -150,8 +163,9 @@ def measure_integration(problem: Problem) -> Integration:
         while substeps <= MAX_SUBSTEPS:
             finer = predict(x, u, 2 * substeps)
             grows = _grows(modes, length / substeps)
+            largest = _errors(present, finer, scale, grows).max()
             # Half of the tolerance: the finer prediction, which is compared with, is off too.
-            if _errors(present, finer, scale, grows).max() <= INTEGRATION_TOLERANCE / 2:
+            if largest <= INTEGRATION_TOLERANCE / 2:
                 suffices = substeps
                 break
             substeps = 2 * substeps
@@ -213,7 +227,12 @@ def _points(problem: Problem) -> Matrix:
     return np.array([reference, *corners])
 
 
-def _errors(present: Matrix, finer: Matrix, scale: Matrix, grows: Mask) -> Matrix:
+def _errors(
+    present: Matrix,
+    finer: Matrix,
+    scale: Matrix,
+    grows: Mask,
+) -> Matrix:
     """Errors (P, n) of predictions (P, n, 1+n+m) that have finer ones.
 
     Where there is no finite one the error is infinite if a mode `grows` (P,), else the solution of
@@ -221,11 +240,13 @@ def _errors(present: Matrix, finer: Matrix, scale: Matrix, grows: Mask) -> Matri
     """
     parts = np.abs(finer - present) * scale
     # Derivatives count at the reference alone: at a corner a table's kinks are no lack of substeps.
-    errors = np.concatenate([parts[:1].max(axis=2), parts[1:, :, 0]])
+    at_reference = parts[:1].max(axis=2)
+    at_corners = parts[1:, :, 0]
+    errors = np.concatenate([at_reference, at_corners])
     errors = np.where(np.isfinite(errors), errors, np.inf)
     finite: Mask = np.array(np.isfinite(finer).all(axis=(1, 2)))
-    without = np.where(grows, np.inf, 0.0)
-    return np.asarray(np.where(finite[:, None], errors, without[:, None]))
+    without_finer = np.where(grows, np.inf, 0.0)
+    return np.asarray(np.where(finite[:, None], errors, without_finer[:, None]))
 
 
 def _grows(modes: NDArray[np.complex128], h: float) -> Mask:
@@ -233,4 +254,7 @@ def _grows(modes: NDArray[np.complex128], h: float) -> Mask:
     # The stability function of RK4: what a step makes of a mode.
     z = modes * h
     growth = np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)
-    return np.asarray(((modes.real < 0) & (growth > 1 + GROWTH_MARGIN)).any(axis=1))
+    decays = modes.real < 0
+    grows_in_steps = growth > 1 + GROWTH_MARGIN
+    wrong = decays & grows_in_steps
+    return np.asarray(wrong.any(axis=1))

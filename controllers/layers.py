@@ -35,7 +35,9 @@ def torch_layer(controller: RtiNmpc) -> Layer:
     torch = _module("torch")
 
     def to_numpy(argument: Any) -> Any:
-        return argument.detach().cpu() if torch.is_tensor(argument) else argument
+        if torch.is_tensor(argument):
+            return argument.detach().cpu()
+        return argument
 
     class RtiNmpcFunction(torch.autograd.Function):  # type: ignore[misc,name-defined]
         @staticmethod
@@ -51,10 +53,12 @@ def torch_layer(controller: RtiNmpc) -> Layer:
             )
 
             def tensor(name: str) -> Any:
-                return torch.from_numpy(getattr(solution, name)).to(states)
+                array = getattr(solution, name)
+                return torch.from_numpy(array).to(states)
 
             if needed:
                 ctx.save_for_backward(*map(tensor, DERIVATIVES))
+            # One θ for all rows gets the sum of its gradients, which its shape says.
             ctx.theta = theta
             ctx.enforced = enforced
             return tensor("action"), tensor("value")
@@ -63,8 +67,14 @@ def torch_layer(controller: RtiNmpc) -> Layer:
         @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
         def backward(ctx: Any, by_action: Any, by_value: Any) -> Any:
             gradients = _pull_back(
-                torch.einsum, ctx.saved_tensors, by_action, by_value, ctx.theta, ctx.enforced
+                torch.einsum,
+                ctx.saved_tensors,
+                by_action,
+                by_value,
+                ctx.theta,
+                ctx.enforced,
             )
+            # The points are held.
             return *gradients, None
 
     def layer(states: Any, theta: Any, enforced: Any = None, points: Any = None) -> Any:
@@ -94,17 +104,28 @@ def jax_layer(controller: RtiNmpc) -> Layer:
 
     def solve(derivatives: bool, states: Any, *others: Any) -> Any:
         """Arrays of the solution by JAX's callback, which must say their shapes beforehand."""
-        names = LAYER_OUTPUTS + DERIVATIVES if derivatives else LAYER_OUTPUTS
+        names = list(LAYER_OUTPUTS)
+        if derivatives:
+            names += DERIVATIVES
+        dtype = states.dtype
 
         def call(*arguments: Any) -> Any:
             solution = controller.feedback_batch(*arguments, derivatives=derivatives)
-            return tuple(getattr(solution, name).astype(states.dtype) for name in names)
+            arrays = [getattr(solution, name) for name in names]
+            return tuple(array.astype(dtype) for array in arrays)
 
+        # JAX traces shapes, not values: what a callback returns must be declared.
         results = []
         for name in names:
             shape = (len(states), *shapes[name])
-            results.append(jax.ShapeDtypeStruct(shape, states.dtype))
-        return jax.pure_callback(call, tuple(results), states, *others, vmap_method="sequential")
+            results.append(jax.ShapeDtypeStruct(shape, dtype))
+        return jax.pure_callback(
+            call,
+            tuple(results),
+            states,
+            *others,
+            vmap_method="sequential",
+        )
 
     def forward(*arguments: Any) -> Any:
         action, value, *derivatives = solve(True, *arguments)
@@ -113,9 +134,17 @@ def jax_layer(controller: RtiNmpc) -> Layer:
     def backward(saved: Any, by: Any) -> Any:
         derivatives, (_, theta, enforced, points) = saved
         by_action, by_value = by
-        gradients = _pull_back(jax.numpy.einsum, derivatives, by_action, by_value, theta, enforced)
+        gradients = _pull_back(
+            jax.numpy.einsum,
+            derivatives,
+            by_action,
+            by_value,
+            theta,
+            enforced,
+        )
         # The points are held: their gradient is zero, in the shape in which they came.
-        return *gradients, jax.tree.map(jax.numpy.zeros_like, points)
+        by_points = jax.tree.map(jax.numpy.zeros_like, points)
+        return *gradients, by_points
 
     @jax.custom_vjp  # type: ignore[untyped-decorator]
     def layer(states: Any, theta: Any, enforced: Any = None, points: Any = None) -> Any:
@@ -133,7 +162,12 @@ def _module(name: str) -> Any:
 
 
 def _pull_back(
-    einsum: Any, derivatives: Any, by_action: Any, by_value: Any, theta: Any, enforced: Any
+    einsum: Any,
+    derivatives: Any,
+    by_action: Any,
+    by_value: Any,
+    theta: Any,
+    enforced: Any,
 ) -> tuple[Any, Any, Any]:
     """Gradients in states, θ and enforced actions of those in the layer's outputs.
 
@@ -151,12 +185,15 @@ def _pull_back(
     value_state, value_theta, value_action, policy_theta, policy_state = derivatives
 
     def pull(value: Any, policy: Any) -> Any:
-        return einsum("k,ki->ki", by_value, value) + einsum("km,kmi->ki", by_action, policy)
+        through_value = einsum("k,ki->ki", by_value, value)
+        through_policy = einsum("km,kmi->ki", by_action, policy)
+        return through_value + through_policy
 
+    by_states = pull(value_state, policy_state)
     by_theta = pull(value_theta, policy_theta)
     if theta.ndim == 1:
         by_theta = by_theta.sum(0)
     by_enforced = None
     if enforced is not None:  # the action that the layer returns is the enforced one
         by_enforced = by_action + einsum("k,ki->ki", by_value, value_action)
-    return pull(value_state, policy_state), by_theta, by_enforced
+    return by_states, by_theta, by_enforced

@@ -27,6 +27,7 @@ class Lqr:
         self.problem = problem
         H = tune(problem).convexification.hessian
         A, B = linear_model(problem)
+        # In the convexified Hessian the active bounds are a cost.
         no_constraints = np.zeros((0, len(H)))
         gain, _ = local_feedback(A, B, H, no_constraints)
         self.gain = -gain
@@ -44,10 +45,12 @@ class Lqr:
             s: State in the model's units, (n,).
             a: Action to enforce, (m,).
         """
+        if a is not None:
+            return Decision(a)
         problem = self.problem
-        u = problem.reference_action - self.gain @ (s - problem.reference_state)
-        action: Array = np.clip(u, problem.action_lower, problem.action_upper)
-        return Decision(action if a is None else a)
+        deviation = s - problem.reference_state
+        u = problem.reference_action - self.gain @ deviation
+        return Decision(np.clip(u, problem.action_lower, problem.action_upper))
 
 
 class PiLoops:
@@ -65,9 +68,12 @@ class PiLoops:
         self.problem = problem
         self.states = pairing(B)
         # The clip gives an integrator a long time constant, and a state without memory a short one.
-        pole = np.clip(np.diag(A), 1e-9, 1.0 - 1e-9)[self.states]
+        poles = np.clip(np.diag(A), 1e-9, 1.0 - 1e-9)
+        pole = poles[self.states]
         time_constant = -1.0 / np.log(pole)
-        sample_gain = B[self.states, np.arange(len(B))]
+        # K = τ/k with the steady gain k of an action, that of a sample over 1 − pole.
+        actions = np.arange(len(B))
+        sample_gain = B[self.states, actions]
         self.gain = time_constant * (1.0 - pole) / sample_gain
         self.reset_time = np.minimum(time_constant, 4.0)
         self.reset()
@@ -90,13 +96,19 @@ class PiLoops:
             a: Action to enforce, (m,).
         """
         problem = self.problem
-        error = (problem.reference_state - s)[self.states]
+        errors = problem.reference_state - s
+        error = errors[self.states]
         u = problem.reference_action + self.gain * (error + self._integral)
         action: Array = np.clip(u, problem.action_lower, problem.action_upper)
         # At a bound the integral stops where it would push on (conditional integration).
-        winds_up = (u - action) * self.gain * error > 0.0
-        self._increment = np.where(winds_up, 0.0, error / self.reset_time)
-        return Decision(action if a is None else a)
+        # The error and what the action lacks have one direction where the integral winds up.
+        beyond = u - action
+        winds_up = beyond * self.gain * error > 0.0
+        increment = error / self.reset_time
+        self._increment = np.where(winds_up, 0.0, increment)
+        if a is not None:
+            action = a
+        return Decision(action)
 
 
 def pairing(gains: Array) -> NDArray[np.intp]:
@@ -105,11 +117,14 @@ def pairing(gains: Array) -> NDArray[np.intp]:
     Raises ControllerError unless G is square and regular and every λ chosen positive.
     """
     try:
-        relative = (gains * np.linalg.inv(gains).T).T
+        inverse = np.linalg.inv(gains)
+        relative = (gains * inverse.T).T
     except np.linalg.LinAlgError:  # not square, or singular
         relative = np.zeros_like(gains.T)
-    actions, states = linear_sum_assignment(np.abs(relative - 1.0))
-    if not (relative[actions, states] > 0.0).all():
+    distance = np.abs(relative - 1.0)
+    actions, states = linear_sum_assignment(distance)
+    chosen = relative[actions, states]
+    if not (chosen > 0.0).all():
         raise ControllerError(
             f"{gains.shape[0]} states and {gains.shape[1]} actions make no PI loops: they are one "
             "state's to each action, and the gains of a sample must allow to pair them"

@@ -2,24 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import isfinite
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ModelError
-from controllers.model_function import ModelFunction
+from cosim.core.modules import exception_line
 
 KINDS = ("states", "actions", "disturbances", "parameters")
 """The kinds of a model's quantities, in the order of its functions' arguments."""
 
 ModelExpression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
+"""A function (x, u, d, p) of a model."""
 
 TEMPERATURES = ("K", "degC", "degF", "°C", "°F")
 """Units whose zero is not that of the quantity's variation."""
+
+
+REMEDIES = (
+    (
+        "truth value",
+        "it asks whether an expression is true, by if, max, min, and, or: "
+        "use casadi.if_else, fmax, fmin, logic_and, logic_or",
+    ),
+    (
+        "'SX' and 'MX'|'MX' and 'SX'",
+        "it mixes MX symbols with its arguments, which are SX: use x, u, d and p alone",
+    ),
+    (
+        "[Oo]ut of bounds",
+        "it reads an entry that x, u, d or p does not have: they are as long as the model's "
+        "quantities",
+    ),
+    (
+        "positional argument|keyword argument",
+        "it must take four arguments (x, u, d, p), whether it uses them or not",
+    ),
+    (
+        "must be real number|float\\(\\)|convert .* to .*float|only (length-1|0-dimensional)|"
+        "ufunc|loop of",
+        "it uses a function of numbers, of math or NumPy, on an expression: use CasADi's",
+    ),
+)
+"""What an exception in a model's function means, by a pattern of its text."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +70,145 @@ class Quantity:
     unit: str
     nominal: float = 0.0
     magnitude: float | None = None
+
+
+@dataclass(frozen=True)
+class ModelFunction:
+    """A function (x, u, d, p) → column of a model, as its user wrote it.
+
+    A call accepts what is a column without doubt, an expression (rows, 1) or a list, tuple or array
+    of `rows` scalars, and returns it as a CasADi column. Anything else is a ModelError, whose one
+    line names the model, the function, what is wrong and how to mend it.
+    """
+
+    function: Callable[..., Any]
+    name: str
+    model: str
+    rows: int
+
+    def __call__(self, x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
+        """The column (rows, 1) at x, u, d and p, symbols or numbers."""
+        try:
+            # Copies: what the function writes into its arguments stays its own.
+            arguments = [_copy(argument) for argument in (x, u, d, p)]
+            result = self.function(*arguments)
+            column: Any = _column(result)
+        except ModelError:
+            raise
+        except Exception as error:  # the user's code may raise anything
+            raise self.error(_meaning(error)) from error
+        if column is None:
+            raise self.error(
+                f"it returned {_words(result)} in place of {self._wanted()}: {self._remedy()}"
+            )
+        if column.shape != (self.rows, 1):
+            rows, columns = column.shape
+            if columns != 1:
+                counted = f"a matrix of {rows} rows and {columns} columns"
+            elif rows != 1:
+                counted = f"{rows} expressions"
+            else:
+                counted = "1 expression"
+            raise self.error(
+                f"it returned {counted} in place of {self._wanted()}: {self._remedy()}"
+            )
+        checked: ca.SX = column
+        return checked
+
+    def check(self, symbols: Sequence[ca.SX]) -> None:
+        """Call it once with the symbols (x, u, d, p); raises ModelError on what cannot be used."""
+        column = self(*symbols)
+        if isinstance(column, ca.MX):
+            raise self.error(
+                "it returned an MX expression: build it of x, u, d and p, which are SX, alone"
+            )
+        function = ca.Function(
+            self.name,
+            list(symbols),
+            [ca.SX(column)],
+            {"allow_free": True},
+        )
+        # A symbol of somebody else's would have no value in any later call.
+        free = [str(symbol) for symbol in function.get_free()]
+        if free:
+            raise self.error(
+                f"it depends on {', '.join(free)}, which is no entry of x, u, d or p: "
+                "make it a parameter or a disturbance of the model, or give it a number"
+            )
+        # A constant that is not finite would be a NaN in every QP, far from its cause.
+        for k in range(function.n_instructions()):
+            if function.instruction_id(k) != ca.OP_CONST:
+                continue
+            constant = function.instruction_constant(k)
+            if not isfinite(constant):
+                raise self.error(
+                    f"it contains the constant {constant}: look for a division by zero, a number "
+                    "that is missing, or math.… or float(…) of an expression"
+                )
+
+    def error(self, reason: str) -> ModelError:
+        """A ModelError about this function."""
+        return ModelError(f"model '{self.model}', {self.name}(x, u, d, p): {reason}")
+
+    def _wanted(self) -> str:
+        if self.rows == 1:
+            return "one expression"
+        return f"{self.rows} expressions, one a state"
+
+    def _remedy(self) -> str:
+        if self.name == "ode":
+            return "return casadi.vertcat(…) with the rate of each state in their order"
+        return "return one scalar, the cost of a sample"
+
+
+def _copy(argument: Any) -> Any:
+    if isinstance(argument, ca.SX | ca.MX | ca.DM):
+        return argument[:, :]
+    return argument
+
+
+def _column(result: Any) -> Any:
+    """What a function returned as a CasADi column; None where it is not one at all."""
+    if isinstance(result, ca.SX | ca.MX | ca.DM):
+        return result
+    if isinstance(result, np.ndarray):
+        if result.ndim == 2 and result.shape[1] == 1:
+            result = result[:, 0]
+        if result.ndim > 1:
+            return None
+        result = result.tolist()  # a list, or a number
+    if isinstance(result, list | tuple):
+        return ca.vertcat(*result)
+    # A comparison that Python has made is a bool, and no cost.
+    if isinstance(result, int | float | np.number) and not isinstance(result, bool):
+        return ca.SX(float(result))
+    return None
+
+
+def _words(result: Any) -> str:
+    if result is None:
+        return "None"
+    kind = type(result).__name__
+    if isinstance(result, np.ndarray):
+        return f"{kind} of shape {result.shape}"
+    return kind
+
+
+def _meaning(error: Exception) -> str:
+    """What went wrong in a function and how to mend it, where that can be told, in one line."""
+    for pattern, remedy in REMEDIES:
+        if re.search(pattern, str(error)):
+            return f"{remedy} ({_short(error)})"
+    return f"it cannot be called with symbols: {_short(error)}"
+
+
+def _short(error: Exception) -> str:
+    """The exception in one line, without CasADi's lists of prototypes."""
+    line = exception_line(error)
+    words, bracket, place = line.rpartition(" (")
+    if len(words) > 160:
+        words = f"{words[:157]}…"
+    return f"{words}{bracket}{place}"
 
 
 @dataclass(frozen=True)
@@ -91,9 +261,12 @@ class Model:
 
     def __post_init__(self) -> None:
         for kind in KINDS:
+            # Tuples, whatever sequence was given: a frozen model stays as it was checked.
             object.__setattr__(self, kind, self._quantities(kind))
-        quantities = [quantity for kind in KINDS for quantity in getattr(self, kind)]
-        names = [quantity.name for quantity in quantities]
+        # Scenarios, files and messages know a quantity by its name alone.
+        names: list[str] = []
+        for kind in KINDS:
+            names += [quantity.name for quantity in getattr(self, kind)]
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:
             raise ModelError(
@@ -103,12 +276,13 @@ class Model:
         for kind in ("states", "actions"):
             if not getattr(self, kind):
                 raise ModelError(f"model '{self.name}' has no {kind}; it needs at least one")
-        if not (isinstance(self.time_unit, int | float) and 0 < self.time_unit < float("inf")):
+        if not _is_positive(self.time_unit):
             raise ModelError(
                 f"model '{self.name}': time_unit must be positive seconds, not {self.time_unit!r}"
             )
         object.__setattr__(self, "uncertain", tuple(self.uncertain))
         self.parameter_indices(self.uncertain)
+        # Called once with symbols: a mistake is reported where the model is made.
         object.__setattr__(self, "ode", self._checked("ode", self.ode, len(self.states)))
         economic_cost = self._checked("economic_cost", self.economic_cost, 1)
         object.__setattr__(self, "economic_cost", economic_cost)
@@ -158,6 +332,7 @@ class Model:
                     f"model '{self.name}': one of the {kind} has no name: {quantity!r}"
                 )
             try:
+                # A user may have written anything, which need not be a number.
                 finite = isfinite(quantity.nominal)
             except TypeError:
                 finite = False
@@ -167,8 +342,7 @@ class Model:
                     f"number, not {quantity.nominal!r}"
                 )
             magnitude = quantity.magnitude
-            positive = isinstance(magnitude, int | float) and 0 < magnitude < float("inf")
-            if magnitude is not None and not positive:
+            if magnitude is not None and not _is_positive(magnitude):
                 raise ModelError(
                     f"model '{self.name}': the magnitude of {quantity.name} must be a positive "
                     f"number, not {magnitude!r}"
@@ -196,7 +370,9 @@ class Model:
                     f"{quantity.unit}, whose nominal value says nothing of its size; add "
                     "magnitude=… to its Quantity, ten times the deviation that you expect"
                 )
-            magnitudes.append(abs(quantity.nominal) if magnitude is None else magnitude)
+            if magnitude is None:
+                magnitude = abs(quantity.nominal)
+            magnitudes.append(magnitude)
         return np.array(magnitudes)
 
     @property
@@ -227,12 +403,17 @@ class Model:
         if len(moved) != len(names):
             raise ModelError(f"model '{self.name}' has not all of {', '.join(names)} to measure")
         # Where each of the present disturbances is among those that stay and those that moved.
-        order = [[*rest, *moved].index(quantity) for quantity in self.disturbances]
+        rearranged_order = [*rest, *moved]
+        order = [rearranged_order.index(quantity) for quantity in self.disturbances]
         count = len(self.parameters)
 
         def rearranged(expression: ModelExpression) -> ModelExpression:
             def call(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
-                return expression(x, u, ca.vertcat(d, p[count:])[order], p[:count])
+                # The model's own functions still get what they were written for.
+                own_parameters = p[:count]
+                measured = p[count:]
+                disturbances = ca.vertcat(d, measured)[order]
+                return expression(x, u, disturbances, own_parameters)
 
             return call
 
@@ -255,7 +436,30 @@ class Model:
         )
 
 
-def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float | ca.SX, substeps: int) -> ca.SX:
+def _is_positive(value: object) -> bool:
+    """Whether a value is a positive finite number."""
+    return isinstance(value, int | float) and 0 < value < float("inf")
+
+
+def by_name(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
+    """The entries of a column by the names of its quantities.
+
+    Args:
+        quantities: One for each entry.
+        column: x, u, d or p, as a model's functions get them.
+    """
+    entries = {}
+    for i, quantity in enumerate(quantities):
+        entries[quantity.name] = column[i]
+    return entries
+
+
+def runge_kutta(
+    rate: Callable[[ca.SX], ca.SX],
+    x: ca.SX,
+    h: float | ca.SX,
+    substeps: int,
+) -> ca.SX:
     """x after some classical RK4 steps of x' = rate(x).
 
     Args:
@@ -282,12 +486,24 @@ def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function
         substeps: Number of RK4 steps a sample.
     """
     x, u, d, p = model.symbols()
+    # A sample is in seconds, the model's rates in its own unit of time.
     h = sampling_time / model.time_unit / substeps
-    x_next = runge_kutta(lambda state: model.ode(state, u, d, p), x, h, substeps)
-    return ca.Function("f", [x, u, d, p], [x_next], ["x", "u", "d", "p"], ["x_next"])
+
+    def rate(state: ca.SX) -> ca.SX:
+        return model.ode(state, u, d, p)
+
+    x_next = runge_kutta(rate, x, h, substeps)
+    return ca.Function(
+        "f",
+        [x, u, d, p],
+        [x_next],
+        ["x", "u", "d", "p"],
+        ["x_next"],
+    )
 
 
 def economic_cost(model: Model) -> ca.Function:
     """Economic cost ℓ(x, u, d, p) as a CasADi function."""
-    x, u, d, p = model.symbols()
-    return ca.Function("l", [x, u, d, p], [model.economic_cost(x, u, d, p)])
+    symbols = model.symbols()
+    cost = model.economic_cost(*symbols)
+    return ca.Function("l", list(symbols), [cost])

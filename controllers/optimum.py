@@ -56,22 +56,28 @@ def optimum_key(plant: PlantProblem, settings: Settings) -> str:
         settings: The solver's settings.
     """
     problem = plant.problem
+    model = problem.model
     law = plant.law
-    symbols = problem.model.symbols()
+    # Of the model's functions what they compute, not how they are written.
+    symbols = model.symbols()
+    rates = model.ode(*symbols)
+    cost = model.economic_cost(*symbols)
     content: dict[str, Any] = {
         "version": SOLVER_VERSION,
-        "ode": _operations(problem.model.ode(*symbols), symbols),
-        "cost": _operations(problem.model.economic_cost(*symbols), symbols),
-        "time_unit": problem.model.time_unit,
+        "ode": _operations(rates, symbols),
+        "cost": _operations(cost, symbols),
+        "time_unit": model.time_unit,
         "sampling_time": problem.sampling_time,
         "discount": 1.0,
         "parameters": plant.parameters.tolist(),
         "law": [law.kind, law.nominal.tolist(), law.ranges.tolist()],
         "settings": asdict(settings) | {"criterion": "average"},
     }
-    content |= {name: getattr(problem, name).tolist() for name in VECTORS}
+    for name in VECTORS:
+        content[name] = getattr(problem, name).tolist()
     text = json.dumps(content, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    digest = hashlib.sha256(text.encode())
+    return digest.hexdigest()[:16]
 
 
 def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
@@ -81,17 +87,22 @@ def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
     # Instructions and not the text of the expression: its names and its layout decide nothing.
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
-        constant = float(function.instruction_constant(k)).hex() if code == ca.OP_CONST else ""
-        lines.append(
-            f"{code} {function.instruction_input(k)} {function.instruction_output(k)} {constant}"
-        )
+        inputs = function.instruction_input(k)
+        outputs = function.instruction_output(k)
+        constant = ""
+        if code == ca.OP_CONST:
+            constant = float(function.instruction_constant(k)).hex()
+        lines.append(f"{code} {inputs} {outputs} {constant}")
     return lines
 
 
 def stored_file(key: str) -> Path | None:
     """File of a solved problem by its key: the package's own, else the user's, else None."""
-    paths = (folder / f"{key}.npz" for folder in (SHIPPED_OPTIMA, cache_folder("optima")))
-    return next((path for path in paths if path.is_file()), None)
+    for folder in (SHIPPED_OPTIMA, cache_folder("optima")):
+        path = folder / f"{key}.npz"
+        if path.is_file():
+            return path
+    return None
 
 
 def keep(key: str, optimum: Optimum) -> Path:
@@ -125,13 +136,16 @@ def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
         "smooth": optimum.grid.smooth,
         "certificate": certificate or None,
     }
-    arrays: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(optimum.grid.axes)}
+    arrays: dict[str, Any] = {}
+    for i, axis in enumerate(optimum.grid.axes):
+        arrays[f"axis_{i}"] = axis
     arrays["actions"] = optimum.actions
     arrays["W"] = optimum.W
     arrays["distribution"] = optimum.distribution
-    arrays["document"] = np.array(json.dumps(document, sort_keys=True))
-    buffer = io.BytesIO()
+    text = json.dumps(document, sort_keys=True)
+    arrays["document"] = np.array(text)
     # Through memory, so that the file appears whole or not at all.
+    buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     return write_atomically(path, buffer.getvalue())
 
@@ -149,6 +163,7 @@ def read_optimum(path: Path, key: str) -> Optimum:
     try:
         arrays = read_arrays(path)
         document = json.loads(str(arrays.pop("document")))
+        # A file may have been renamed, and then it is another problem's.
         if document["key"] != key:
             raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
         return _optimum_of(arrays, document)
@@ -161,14 +176,17 @@ def read_optimum(path: Path, key: str) -> Optimum:
 
 def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optimum:
     """The optimum in a file's arrays and document."""
-    count = sum(name.startswith("axis_") for name in arrays)
-    axes = tuple(arrays[f"axis_{i}"] for i in range(count))
+    n_axes = sum(name.startswith("axis_") for name in arrays)
+    axes = [arrays[f"axis_{i}"] for i in range(n_axes)]
+    # JSON has lists for tuples, and may have a whole number for a float.
     smooth = document["smooth"]
     if smooth:
-        smooth = tuple((float(first), float(last)) for first, last in smooth)
+        intervals = [(float(first), float(last)) for first, last in smooth]
+        smooth = tuple(intervals)
     accuracy = document["accuracy"]
+    estimates = document["certificate"] or ()
     return Optimum(
-        Grid(axes, smooth),
+        Grid(tuple(axes), smooth),
         actions=arrays["actions"],
         W=arrays["W"],
         distribution=arrays["distribution"],
@@ -180,7 +198,7 @@ def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optim
         ),
         lower=float(document["lower"]),
         upper=float(document["upper"]),
-        certificate=tuple(GainEstimate(**estimate) for estimate in document["certificate"] or ()),
+        certificate=tuple(GainEstimate(**estimate) for estimate in estimates),
     )
 
 
@@ -203,12 +221,16 @@ class OptimalPolicy:
         self.problem = plant.problem
         self.optimum = optimum
         self._plant = plant
-        self._axes = [axis.tolist() for axis in optimum.grid.axes]
-        self._table = np.column_stack([optimum.actions, optimum.W]).tolist()
+        grid = optimum.grid
+        self._axes = [axis.tolist() for axis in grid.axes]
+        # A row (action…, W) for each state of the grid.
+        table = np.column_stack([optimum.actions, optimum.W])
+        self._table = table.tolist()
         # A cell's corners, and how far each one's row in the table is behind that of the first.
         self._corners = []
-        for corner in itertools.product((0, 1), repeat=len(self._axes)):
-            offset = int(np.ravel_multi_index(corner, optimum.grid.shape))
+        shape = [len(axis) for axis in self._axes]
+        for corner in itertools.product((0, 1), repeat=len(shape)):
+            offset = int(np.ravel_multi_index(corner, shape))
             self._corners.append((corner, offset))
 
     @classmethod
@@ -230,7 +252,10 @@ class OptimalPolicy:
         """
         plant = PlantProblem.from_scenario(scenario)
         key = optimum_key(plant, Settings())
-        path = stored_file(key) or keep(key, solve(plant, progress=progress))
+        path = stored_file(key)
+        if path is None:
+            optimum = solve(plant, progress=progress)
+            path = keep(key, optimum)
         return cls(plant, read_optimum(path, key))
 
     @property
@@ -255,18 +280,20 @@ class OptimalPolicy:
             QpError: s or a is not finite.
         """
         state: list[float] = np.asarray(s, dtype=np.float64).tolist()
-        if len(state) != len(self._axes) or not isfinite(sum(state)):
-            raise QpError(
-                f"state {state} is not {len(self._axes)} finite numbers", status="bad state"
-            )
+        n = len(self._axes)
+        if len(state) != n or not isfinite(sum(state)):
+            raise QpError(f"state {state} is not {n} finite numbers", status="bad state")
         # The grid ends where no sample of the closed loop was: say so, and go on.
         row, clamped = self._lookup(state)
         status = "clamped" if clamped else "solved"
         if a is None:
-            value = row.pop() + self.problem.penalty(state)
-            return Decision(np.array(row), value, status, 0.0)
-        action = np.array(a, dtype=np.float64)
-        return Decision(action, self.action_value(state, action), status, 0.0)
+            W = row.pop()
+            action = np.array(row)
+            value = W + self.problem.penalty(state)
+        else:
+            action = np.array(a, dtype=np.float64)
+            value = self.action_value(state, action)
+        return Decision(action, value, status, 0.0)
 
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q*(s, a) = penalty(s) + E[ℓ − J* + V*(s₊)].
@@ -278,17 +305,20 @@ class OptimalPolicy:
         Raises:
             QpError: a is not finite.
         """
+        problem = self.problem
+        optimum = self.optimum
+        m = problem.n_actions
         state = np.array(s, dtype=np.float64).reshape(1, -1)
         action = np.array(a, dtype=np.float64).reshape(1, -1)
-        if action.shape[1] != self.problem.n_actions or not np.isfinite(action).all():
+        if action.shape[1] != m or not np.isfinite(action).all():
             raise QpError(
-                f"action {action[0].tolist()} is not {self.problem.n_actions} finite numbers",
+                f"action {action[0].tolist()} is not {m} finite numbers",
                 status="bad action",
             )
-        optimum = self.optimum
         # An action that is not the policy's has no stored value: compute its expectation.
-        smooth = self._operator.values(state, action, optimum.grid, optimum.W)[0]
-        return float(smooth) - optimum.gain + self.problem.penalty(state[0].tolist())
+        (expected,) = self._operator.values(state, action, optimum.grid, optimum.W)
+        penalty = problem.penalty(state[0].tolist())
+        return float(expected) - optimum.gain + penalty
 
     @cached_property
     def _operator(self) -> BellmanOperator:
@@ -301,8 +331,12 @@ class OptimalPolicy:
         fractions = []
         for x, axis in zip(state, self._axes, strict=True):
             # The last cell includes its upper end.
-            cell = min(max(bisect_right(axis, x) - 1, 0), len(axis) - 2)
-            fraction = (x - axis[cell]) / (axis[cell + 1] - axis[cell])
+            last_cell = len(axis) - 2
+            cell = bisect_right(axis, x) - 1
+            cell = min(max(cell, 0), last_cell)
+            begin = axis[cell]
+            end = axis[cell + 1]
+            fraction = (x - begin) / (end - begin)
             if not 0.0 <= fraction <= 1.0:
                 fraction = min(max(fraction, 0.0), 1.0)
                 clamped = True
@@ -314,9 +348,11 @@ class OptimalPolicy:
             for fraction, high in zip(fractions, corner, strict=True):
                 # Multilinear: the weight of a corner is the product over the axes.
                 weight *= fraction if high else 1.0 - fraction
-            if weight:
-                for i, entry in enumerate(self._table[base + offset]):
-                    row[i] += weight * entry
+            if not weight:
+                continue
+            corner_row = self._table[base + offset]
+            for i, entry in enumerate(corner_row):
+                row[i] += weight * entry
         return row, clamped
 
 
@@ -333,6 +369,7 @@ def fouling(scenario: Scenario) -> tuple[str, Callable[[ArrayLike], Vector]] | N
     rate = float(given.get("fouling_rate", 0.0))
     floor = float(given.get("fouling_floor", 0.7))
     period = float(given.get("cleaning_period", 0.0))
+    # The plant does not foul, or does so without an effect.
     if rate == 0.0 or floor == 1.0:
         return None
     if not period > 0.0:
@@ -340,17 +377,24 @@ def fouling(scenario: Scenario) -> tuple[str, Callable[[ArrayLike], Vector]] | N
             "the quasi-static optimum needs a condenser that is cleaned: set "
             "plant.parameters.cleaning_period above 0"
         )
-    model = load_model(scenario.plant.model or scenario.controller.model)
+    model = _plant_model(scenario)
     if not model.uncertain:
         raise OptimumError(f"model '{model.name}' names no uncertain parameter that could foul")
     name = model.uncertain[0]
     clean = _parameter(scenario, model, name)
 
     def value(time: ArrayLike) -> Vector:
-        since = np.mod(np.asarray(time) / SECONDS_A_DAY, period)
-        return np.asarray(clean * (floor + (1.0 - floor) * np.exp(-rate * since)))
+        days = np.asarray(time) / SECONDS_A_DAY
+        since_cleaning = np.mod(days, period)
+        remaining = floor + (1.0 - floor) * np.exp(-rate * since_cleaning)
+        return np.asarray(clean * remaining)
 
     return name, value
+
+
+def _plant_model(scenario: Scenario) -> Model:
+    """The model of a scenario's plant: `plant.model`, else the controller's."""
+    return load_model(scenario.plant.model or scenario.controller.model)
 
 
 @dataclass(frozen=True)
@@ -384,16 +428,22 @@ def change_of(scenario: Scenario) -> Change | None:
     return None
 
 
-def _fouling_change(scenario: Scenario, name: str, value: Callable[[ArrayLike], Vector]) -> Change:
+def _fouling_change(
+    scenario: Scenario,
+    name: str,
+    value: Callable[[ArrayLike], Vector],
+) -> Change:
     """The change of a parameter that fouls, whose values at times in s are `value(time)`."""
     cycle = SECONDS_A_DAY * scenario.plant.parameters["cleaning_period"]
     # A microsecond before the cleaning, and after it.
     fouled = value(cycle - 1e-6)
     clean = value(0.0)
     nodes = np.linspace(fouled, clean, FOULING_NODES).round(6).tolist()
+    numbers = np.arange(FOULING_NODES)
 
     def position(time: ArrayLike) -> Vector:
-        return np.asarray(np.interp(value(time), nodes, range(FOULING_NODES)), dtype=np.float64)
+        among_nodes = np.interp(value(time), nodes, numbers)
+        return np.asarray(among_nodes, dtype=np.float64)
 
     # The mean over a cycle, whose integrand is smooth, by Gauss–Legendre.
     x, weights = np.polynomial.legendre.leggauss(40)
@@ -408,8 +458,9 @@ def _fouling_change(scenario: Scenario, name: str, value: Callable[[ArrayLike], 
 
 def _jumps(scenario: Scenario, changes: Sequence[ChangeTable]) -> Change:
     """The changes of `plant.changes`, between which the plant stays as it is."""
-    model = load_model(scenario.plant.model or scenario.controller.model)
-    starts = np.array([0.0, *(change.time for change in changes)])
+    model = _plant_model(scenario)
+    times = [change.time for change in changes]
+    starts = np.array([0.0, *times])
     plants = [scenario.at(start) for start in starts.tolist()]
     parameters: dict[str, Sequence[float]] = {}
     for change in changes:
@@ -417,13 +468,15 @@ def _jumps(scenario: Scenario, changes: Sequence[ChangeTable]) -> Change:
             parameters[name] = [_parameter(plant, model, name) for plant in plants]
 
     def position(time: ArrayLike) -> Vector:
-        return np.asarray(np.searchsorted(starts, time, side="right") - 1, dtype=np.float64)
+        number = np.searchsorted(starts, time, side="right") - 1
+        return np.asarray(number, dtype=np.float64)
 
     return Change(
         plants=plants,
         parameters=parameters,
         position=position,
         times=starts[:-1],
+        # The last plant has no end, so it has no share of the mean.
         weights=np.diff(starts) / starts[-1],
     )
 
@@ -447,7 +500,8 @@ def frozen(scenario: Scenario, name: str, value: float) -> Scenario:
 
 def _parameter(scenario: Scenario, model: Model, name: str) -> float:
     """A plant parameter as the scenario sets it, else as the plant's model has it."""
-    nominal = model.nominal_parameters[model.parameter_indices((name,))[0]]
+    (index,) = model.parameter_indices((name,))
+    nominal = model.nominal_parameters[index]
     return float(scenario.plant.parameters.get(name, nominal))
 
 
@@ -465,7 +519,10 @@ class QuasiStaticPolicy:
     name = "optimal"
 
     def __init__(
-        self, law: Change, policies: Sequence[OptimalPolicy], sampling_time: float
+        self,
+        law: Change,
+        policies: Sequence[OptimalPolicy],
+        sampling_time: float,
     ) -> None:
         self.law = law
         self.policies = tuple(policies)
@@ -474,7 +531,10 @@ class QuasiStaticPolicy:
 
     @classmethod
     def from_scenario(
-        cls, scenario: Scenario, *, progress: RoundProgress | None = None
+        cls,
+        scenario: Scenario,
+        *,
+        progress: RoundProgress | None = None,
     ) -> QuasiStaticPolicy:
         """Policy of a scenario whose plant changes; optima that are not stored are solved.
 
@@ -487,7 +547,9 @@ class QuasiStaticPolicy:
         """
         law = change_of(scenario)
         assert law is not None
-        policies = [OptimalPolicy.from_scenario(plant, progress=progress) for plant in law.plants]
+        policies = []
+        for plant in law.plants:
+            policies.append(OptimalPolicy.from_scenario(plant, progress=progress))
         return cls(law, policies, scenario.sampling_time)
 
     @property
@@ -498,14 +560,17 @@ class QuasiStaticPolicy:
     @property
     def gain(self) -> float:
         """Mean of J* over one cycle of fouling, or from the start to the last jump."""
-        return float(self.gain_at(self.law.times) @ self.law.weights)
+        gains = self.gain_at(self.law.times)
+        return float(gains @ self.law.weights)
 
     def gain_at(self, time: ArrayLike) -> Vector:
         """J* of the plant as it is at times in s, between the nodes by monotone cubics."""
         from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second
 
         nodes = np.arange(len(self.policies))
-        gains: Vector = PchipInterpolator(nodes, self.gains)(self.law.position(time))
+        # Another cubic could overshoot between the nodes.
+        interpolate = PchipInterpolator(nodes, self.gains)
+        gains: Vector = interpolate(self.law.position(time))
         return gains
 
     def reset(self) -> None:
@@ -524,17 +589,20 @@ class QuasiStaticPolicy:
             a: Action to enforce, (m,).
         """
         # The position is between two plants; its fraction is the share of the second.
-        share, lower = modf(self.law.position(max(self._sample, 0) * self._h))
-        first = self.policies[int(lower)].feedback(s, a)
+        time = max(self._sample, 0) * self._h
+        share, whole = modf(self.law.position(time))
+        lower = int(whole)
+        first = self.policies[lower].feedback(s, a)
         if share == 0.0:
             return first
-        second = self.policies[int(lower) + 1].feedback(s, a)
+        second = self.policies[lower + 1].feedback(s, a)
+        rest = 1.0 - share
         clamped = "clamped" in (first.status, second.status)
         return Decision(
-            (1.0 - share) * first.action + share * second.action,
-            (1.0 - share) * first.value + share * second.value,
-            "clamped" if clamped else "solved",
-            0.0,
+            action=rest * first.action + share * second.action,
+            value=rest * first.value + share * second.value,
+            status="clamped" if clamped else "solved",
+            residual=0.0,
         )
 
 
@@ -548,6 +616,7 @@ def stored_optimum(scenario: Scenario) -> str | None:
     if is_file(scenario.plant.fmu) and scenario.plant.model is None:
         return None
     change = change_of(scenario)
+    # An optimum that is not stored would be solved for minutes: nobody has asked for that.
     for plant in change.plants if change else [scenario]:
         try:
             problem = PlantProblem.from_scenario(plant)

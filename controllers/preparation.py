@@ -16,19 +16,34 @@ from controllers.functions import StackedFunction
 from controllers.integration import check_integration
 from controllers.model import runge_kutta
 from controllers.problem import Problem
-from controllers.qp import SoftQp
+from controllers.qp import LEAST_SIZE, SoftQp
 from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
 from cosim.core.protocols import Vector
 from cosim.core.validation import instead
 
 SOLVED_RESIDUAL = 1e-8
 """Largest KKT residual of a QP that counts as solved."""
-LEAST_SIZE = 1e-30
-"""What a size is at least, so that it can divide."""
+
+
+Shapes = Mapping[str, tuple[int, int]]
+"""Rows and columns of matrices by name."""
+
+
+def scalar_symbols(shapes: Shapes) -> dict[str, ca.SX]:
+    """Symbols of these shapes for an expression in scalars (SX)."""
+    return {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
+
+
+def matrix_symbols(shapes: Shapes) -> dict[str, ca.MX]:
+    """Symbols of these shapes for a graph of calls of other functions (MX)."""
+    return {name: ca.MX.sym(name, *shape) for name, shape in shapes.items()}
 
 
 def sampled_jacobian(
-    problem: Problem, x: ca.SX, u: ca.SX, parameters: ca.SX
+    problem: Problem,
+    x: ca.SX,
+    u: ca.SX,
+    parameters: ca.SX,
 ) -> tuple[ca.SX, ca.SX]:
     """State after one sample of the nominal model, and its Jacobian with respect to (x, u).
 
@@ -54,19 +69,31 @@ def sampled_jacobian(
     action = ca.SX.sym("held", m)
     disturbance = ca.SX(ca.DM(model.nominal_disturbance))
     rate = model.ode(state, action, disturbance, parameters)
-    slopes = [ca.jacobian(rate, state), ca.jacobian(rate, action)]
-    evaluate = ca.Function("slope", [state, action, *free], [rate, *slopes])
+    rate_by_state = ca.jacobian(rate, state)
+    rate_by_action = ca.jacobian(rate, action)
+    evaluate = ca.Function(
+        "slope",
+        [state, action, *free],
+        [rate, rate_by_state, rate_by_action],
+    )
 
     def rate_and_variation(columns: ca.SX) -> ca.SX:
         """d/dt of (x, ∂x/∂(x, u)), whose columns are side by side."""
-        value, by_state, by_action = evaluate(columns[:, 0], u, *free)
-        variation = by_state @ columns[:, 1:] + ca.horzcat(ca.SX(n, n), by_action)
+        present_x = columns[:, 0]
+        jacobian = columns[:, 1:]
+        value, by_state, by_action = evaluate(present_x, u, *free)
+        # d/dt J = ∂ẋ/∂x J + (0, ∂ẋ/∂u).
+        forcing = ca.horzcat(ca.SX(n, n), by_action)
+        variation = by_state @ jacobian + forcing
         return ca.horzcat(value, variation)
 
+    # At the start ∂x/∂x = I and ∂x/∂u = 0.
     step = problem.sampling_time / model.time_unit / problem.substeps
     start = ca.horzcat(x, ca.SX.eye(n), ca.SX(n, m))
     end = runge_kutta(rate_and_variation, start, step, problem.substeps)
-    return end[:, 0], end[:, 1:]
+    x_next = end[:, 0]
+    jacobian = end[:, 1:]
+    return x_next, jacobian
 
 
 def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
@@ -87,23 +114,34 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     x_s = ca.DM(problem.reference_state)
     u_s = ca.DM(problem.reference_action)
 
+    # x₊ = f + A (x − x_k) + B (u − u_k) + c_f, in deviations from the reference.
     x_next, jacobian = sampled_jacobian(problem, x, u, symbols["model_parameters"])
     A = jacobian[:, :n]
     B = jacobian[:, n:]
-    offset = x_next - x_s - A @ (x - x_s) - B @ (u - u_s) + symbols["c_f"]
+    offset = x_next - x_s
+    offset = offset - A @ (x - x_s)
+    offset = offset - B @ (u - u_s)
+    offset = offset + symbols["c_f"]
 
-    state_units = ca.DM(np.outer(1 / scale.state, scale.state))
-    action_units = ca.DM(np.outer(1 / scale.state, scale.action))
-    arguments = {"x": x, "u": u, "theta": symbols["theta"]}
-    results = {
-        "A": (A * state_units).T,
-        "B": (B * action_units).T,
-        "r": offset / ca.DM(scale.state),
-    }
-    return stage_function("linearise", arguments, results)
+    # The transposes, since CasADi's memory is by columns and C's by rows.
+    per_state = 1 / scale.state
+    state_units = ca.DM(np.outer(per_state, scale.state))
+    action_units = ca.DM(np.outer(per_state, scale.action))
+    A_scaled = A * state_units
+    B_scaled = B * action_units
+    return stage_function(
+        "linearise",
+        {"x": x, "u": u, "theta": symbols["theta"]},
+        {"A": A_scaled.T, "B": B_scaled.T, "r": offset / ca.DM(scale.state)},
+    )
 
 
-def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> ca.Function:
+def stage_parameter_gradient(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    *,
+    exact: bool,
+) -> ca.Function:
     """One stage's ∇_p of the QP's Lagrangian in the model parameters p that θ holds.
 
     That is ∇_p [χᵀ(f + J Δw) + ⟨M, D⟩] with f and its Jacobian J at (x, u) and the step
@@ -123,25 +161,32 @@ def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bo
     n = problem.n_states
     m = problem.n_actions
     x, u, symbols = _linearisation_symbols(problem, blocks)
+    theta = symbols["theta"]
     w = ca.SX.sym("w", n + m)
     chi = ca.SX.sym("chi", n)
-    arguments = {"x": x, "u": u, "theta": symbols["theta"], "w": w, "chi": chi}
+    arguments = {"x": x, "u": u, "theta": theta, "w": w, "chi": chi}
 
+    # χᵀ(f + J Δw), whose J Δw is one tangent through the model.
     x_next, _ = sampled_jacobian(problem, x, u, symbols["model_parameters"])
     point = ca.vertcat(x, u)
-    lagrangian = ca.dot(chi, x_next + ca.jtimes(x_next, point, w - point))
+    tangent = ca.jtimes(x_next, point, w - point)
+    lagrangian = ca.dot(chi, x_next + tangent)
     if exact:
         M = ca.SX.sym("M", n + m, n + m)
         guess = ca.SX.sym("guess", n)
-        lagrangian += ca.dot(M, _curvature(problem, symbols, x, u, guess))
+        D = _curvature(problem, symbols, x, u, guess)
+        lagrangian += ca.dot(M, D)
         arguments |= {"M": M, "guess": guess}
     # By θ and not by p alone: p's symbols are entries of θ's.
-    gradient = ca.gradient(lagrangian, symbols["theta"])[blocks.slices["p"]]
-    return stage_function("parameter_gradient", arguments, {"gradient": gradient})
+    by_theta = ca.gradient(lagrangian, theta)
+    results = {"gradient": by_theta[blocks.slices["p"]]}
+    return stage_function("parameter_gradient", arguments, results)
 
 
 def stage_function(
-    name: str, arguments: Mapping[str, ca.SX], results: Mapping[str, ca.SX]
+    name: str,
+    arguments: Mapping[str, ca.SX],
+    results: Mapping[str, ca.SX],
 ) -> ca.Function:
     """Function of one stage, to be mapped over the horizon: dense, common expressions shared.
 
@@ -160,17 +205,27 @@ def stage_function(
     )
 
 
-def _linearisation_symbols(problem: Problem, blocks: ThetaBlocks) -> tuple[ca.SX, ca.SX, Symbols]:
+def _linearisation_symbols(
+    problem: Problem,
+    blocks: ThetaBlocks,
+) -> tuple[ca.SX, ca.SX, Symbols]:
     """Symbols of a stage's state (n,) and action (m,), and those of θ."""
     x = ca.SX.sym("x", problem.n_states)
     u = ca.SX.sym("u", problem.n_actions)
     return x, u, symbolic_theta(problem, blocks)
 
 
-def _curvature(problem: Problem, symbols: Symbols, x: ca.SX, u: ca.SX, chi: ca.SX) -> ca.SX:
+def _curvature(
+    problem: Problem,
+    symbols: Symbols,
+    x: ca.SX,
+    u: ca.SX,
+    chi: ca.SX,
+) -> ca.SX:
     """D = ∇²_(x,u) χᵀf(x, u), (n+m, n+m), of the sampled model f."""
     x_next, _ = sampled_jacobian(problem, x, u, symbols["model_parameters"])
-    hessian, _ = ca.hessian(ca.dot(chi, x_next), ca.vertcat(x, u))
+    contracted = ca.dot(chi, x_next)
+    hessian, _ = ca.hessian(contracted, ca.vertcat(x, u))
     return hessian
 
 
@@ -200,15 +255,16 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     m = problem.n_actions
     horizon = problem.horizon
     width = horizon * m
-    arguments = {
-        "x": ca.MX.sym("x", n, horizon),
-        "u": ca.MX.sym("u", m, horizon),
-        "L": ca.MX.sym("L", n + m, horizon * (n + m)),
-        "q": ca.MX.sym("q", n + m, horizon),
-        "L_N": ca.MX.sym("L_N", n, n),
-        "q_N": ca.MX.sym("q_N", n),
-        "theta": ca.MX.sym("theta", blocks.size),
+    shapes = {
+        "x": (n, horizon),
+        "u": (m, horizon),
+        "L": (n + m, horizon * (n + m)),
+        "q": (n + m, horizon),
+        "L_N": (n, n),
+        "q_N": (n, 1),
+        "theta": (blocks.size, 1),
     }
+    arguments = matrix_symbols(shapes)
     theta = ca.repmat(arguments["theta"], 1, horizon)
     linearise = stage_linearisation(problem, blocks).map(horizon)
     A, B, r = linearise(arguments["x"], arguments["u"], theta)
@@ -218,13 +274,16 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     L_k = ca.horzsplit(arguments["L"], n + m)
     q_k = ca.horzsplit(arguments["q"], 1)
 
-    # Forward: ξ_0 responds to itself alone.
+    # Forward: ξ_0 responds to itself alone, not to the controls before it nor to the offsets.
     respond = _respond(n, m, horizon)
-    start = np.hstack([np.zeros((n, width)), np.eye(n), np.zeros((n, 1))])
+    to_controls = np.zeros((n, width))
+    to_offsets = np.zeros((n, 1))
+    start = np.hstack([to_controls, np.eye(n), to_offsets])
     dense = ca.Sparsity.dense(*start.shape)
     responses = [ca.MX(ca.DM(dense, start.reshape(-1, order="F")))]
     for k in range(horizon):
-        responses.append(respond(A_k[k], B_k[k], r_k[k], responses[k]))
+        following = respond(A_k[k], B_k[k], r_k[k], responses[k])
+        responses.append(following)
 
     # Backward: the costates' responses, from those of the terminal cost's gradient on.
     differentiate = _differentiate(n, m, horizon)
@@ -232,23 +291,34 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     costate = ca.horzcat(costate[:, :-1], costate[:, -1] + arguments["q_N"])
     rows: list[ca.MX] = []
     for k in reversed(range(horizon)):
-        row, costate = differentiate(A_k[k], B_k[k], L_k[k], q_k[k], responses[k], costate)
+        row, costate = differentiate(
+            A_k[k],
+            B_k[k],
+            L_k[k],
+            q_k[k],
+            responses[k],
+            costate,
+        )
         rows.insert(0, row)
 
     # Columns behind those of the controls belong to ξ_0, the last one to the offsets.
-    by_start = [response[:, width:] for response in responses[1:]]
+    states = responses[1:]
     hessian = _gather(ca.horzcat(*rows), _hessian_positions(n, m, horizon))
-    gamma = _gather(ca.horzcat(*responses[1:]), _response_positions(n, m, horizon))
+    gamma = _gather(ca.horzcat(*states), _response_positions(n, m, horizon))
+    Phi = [response[:, width : width + n] for response in states]
+    g = [response[:, -1] for response in states]
+    F = [row[:, width:-1] for row in rows]
+    f = [row[:, -1] for row in rows]
     results = {
         "A": A,
         "B": B,
         "r": r,
         "H": hessian,
         "Gamma": gamma.T,
-        "Phi": ca.vertcat(*(response[:, :n] for response in by_start)).T,
-        "g": ca.vertcat(*(response[:, n] for response in by_start)),
-        "f": ca.vertcat(*(row[:, -1] for row in rows)),
-        "F": ca.vertcat(*(row[:, width:-1] for row in rows)).T,
+        "Phi": ca.vertcat(*Phi).T,
+        "g": ca.vertcat(*g),
+        "f": ca.vertcat(*f),
+        "F": ca.vertcat(*F).T,
     }
     room = {
         "costates": horizon * n,
@@ -262,82 +332,106 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
 def _respond(n: int, m: int, horizon: int) -> ca.Function:
     """Responses (n, Nm + n + 1) of ξ_{k+1} from those of ξ_k: to each control, ξ_0 and offsets."""
     width = horizon * m
-    A = ca.SX.sym("A", n, n)
-    B = ca.SX.sym("B", m, n)
-    r = ca.SX.sym("r", n)
-    response = ca.SX.sym("response", n, width + n + 1)
+    symbols = scalar_symbols(
+        {
+            "A": (n, n),
+            "B": (m, n),
+            "r": (n, 1),
+            "response": (n, width + n + 1),
+        }
+    )
+    A = symbols["A"]
+    B = symbols["B"]
 
-    following = A.T @ response
-    following[:, -1] += r
+    following = A.T @ symbols["response"]
+    following[:, -1] += symbols["r"]
     # Every control is one sample older; the oldest columns, of controls yet to come, are zero.
-    older = ca.horzcat(following[:, : width - m], following[:, width:])
-    arguments = {"A": A, "B": B, "r": r, "response": response}
-    return stage_function("respond", arguments, {"following": ca.horzcat(B.T, older)})
+    to_controls = following[:, : width - m]
+    to_others = following[:, width:]
+    results = {"following": ca.horzcat(B.T, to_controls, to_others)}
+    return stage_function("respond", symbols, results)
 
 
 def _differentiate(n: int, m: int, horizon: int) -> ca.Function:
     """Rows (m, Nm + n + 1) of the gradient in v_k and costates (n, Nm + n + 1) at stage k."""
     width = horizon * m
-    A = ca.SX.sym("A", n, n)
-    B = ca.SX.sym("B", m, n)
-    L = ca.SX.sym("L", n + m, n + m)
-    q = ca.SX.sym("q", n + m)
-    response = ca.SX.sym("response", n, width + n + 1)
-    costate = ca.SX.sym("costate", n, width + n + 1)
+    symbols = scalar_symbols(
+        {
+            "A": (n, n),
+            "B": (m, n),
+            "L": (n + m, n + m),
+            "q": (n + m, 1),
+            "response": (n, width + n + 1),
+            "costate": (n, width + n + 1),
+        }
+    )
+    A = symbols["A"]
+    B = symbols["B"]
+    L = symbols["L"]
+    q = symbols["q"]
+    response = symbols["response"]
+    costate = symbols["costate"]
 
     # The costate of stage k+1 responds to v_k first, which is one control more than ξ_k does.
+    to_own_control = costate[:, :m]
+    to_others = costate[:, m:]
     states = ca.horzcat(response[:, : width - m], response[:, width:])
-    row = L[n:, :n] @ states + B @ costate[:, m:]
-    row[:, -1] += q[n:]
-    previous = L[:n, :n] @ states + A @ costate[:, m:]
-    previous[:, -1] += q[:n]
 
-    arguments = {
-        "A": A,
-        "B": B,
-        "L": L,
-        "q": q,
-        "response": response,
-        "costate": costate,
-    }
+    # Gradient in v_k: L_vx ξ_k + L_vv v_k + q_v + Bᵀ χ_{k+1}.
+    row = L[n:, :n] @ states + B @ to_others
+    row[:, -1] += q[n:]
+    own = B @ to_own_control + L[n:, n:]
+
+    # Costate of stage k: L_xx ξ_k + q_x + Aᵀ χ_{k+1}; ξ_k does not respond to v_k.
+    previous = L[:n, :n] @ states + A @ to_others
+    previous[:, -1] += q[:n]
+    to_controls = previous[:, : width - m]
     none_yet = ca.SX(n, m)
     results = {
-        "row": ca.horzcat(B @ costate[:, :m] + L[n:, n:], row),
-        "previous": ca.horzcat(previous[:, : width - m], none_yet, previous[:, width - m :]),
+        "row": ca.horzcat(own, row),
+        "previous": ca.horzcat(to_controls, none_yet, previous[:, width - m :]),
     }
-    return stage_function("differentiate", arguments, results)
+    return stage_function("differentiate", symbols, results)
 
 
 def _gather(source: ca.MX, positions: NDArray[np.int64]) -> ca.MX:
     """Matrix of the source's entries at positions in column-major order; −1 stands for zero."""
+    zero_position = source.numel()
     extended = ca.vertcat(ca.vec(source), 0)
-    index = np.where(positions < 0, source.numel(), positions)
-    entries = extended[index.reshape(-1, order="F").tolist()]
-    return ca.reshape(entries, *positions.shape)
+    index = np.where(positions < 0, zero_position, positions)
+    by_columns = index.reshape(-1, order="F").tolist()
+    return ca.reshape(extended[by_columns], *positions.shape)
 
 
 def _hessian_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     """Positions of H's entries, (Nm, Nm), in the rows of all stages; its upper triangle mirrors."""
+    # The Hessian is symmetric: of a pair of controls the later one's row has the entry.
     first, second = np.indices((horizon * m, horizon * m))
-    # Row a of stage k, and control b of stage j ≤ k.
+    # Row a of stage k, and control b of stage j ≤ k, whose age there is k − j.
     k, a = np.divmod(np.maximum(first, second), m)
     j, b = np.divmod(np.minimum(first, second), m)
-    column: NDArray[np.int64] = k * (horizon * m + n + 1) + (k - j) * m + b
+    columns_a_stage = horizon * m + n + 1
+    column: NDArray[np.int64] = k * columns_a_stage + (k - j) * m + b
     return column * m + a
 
 
 def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     """Positions of Γ's entries, (Nn, Nm), in the responses of ξ_1 … ξ_N; −1 above its diagonal."""
     first, second = np.indices((horizon * n, horizon * m))
-    # State i of stage k+1, and control b of stage j.
+    # State i of stage k+1, and control b of stage j, whose age there is k − j.
     k, i = np.divmod(first, n)
     j, b = np.divmod(second, m)
-    column = k * (horizon * m + n + 1) + (k - j) * m + b
-    return np.asarray(np.where(j <= k, column * n + i, -1))
+    columns_a_stage = horizon * m + n + 1
+    column = k * columns_a_stage + (k - j) * m + b
+    position = column * n + i
+    return np.asarray(np.where(j <= k, position, -1))
 
 
 def embedding(
-    problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction, read: StackedFunction
+    problem: Problem,
+    blocks: ThetaBlocks,
+    prepared: StackedFunction,
+    read: StackedFunction,
 ) -> StackedFunction:
     """Initial value embedding: the vectors of the QP that depend on the state s.
 
@@ -359,12 +453,14 @@ def embedding(
     s = ca.SX.sym("s", n)
     x_s = ca.DM(problem.reference_state)
     state_scale = ca.DM(problem.scale.state)
-    condensed = {
-        "Phi": ca.SX.sym("Phi", n, horizon * n),
-        "g": ca.SX.sym("g", horizon * n),
-        "f": ca.SX.sym("f", horizon * m),
-        "F": ca.SX.sym("F", n, horizon * m),
-    }
+    condensed = scalar_symbols(
+        {
+            "Phi": (n, horizon * n),
+            "g": (horizon * n, 1),
+            "f": (horizon * m, 1),
+            "F": (n, horizon * m),
+        }
+    )
 
     xi = (s - x_s) / state_scale
     # What the states do with no control; the rows have room for the controls' part.
@@ -377,6 +473,7 @@ def embedding(
         "upper": ca.repmat(upper, horizon, 1) - free,
     }
 
+    # The three functions work in one memory: nothing is copied between them.
     shared = {name: prepared.part(name) for name in condensed}
     shared["theta"] = prepared.inputs["theta"]
     shared["s"] = read.inputs["s"]
@@ -404,7 +501,42 @@ class _SoftBounds(NamedTuple):
     W: ca.SX
 
 
-def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
+class _Stage(NamedTuple):
+    """A stage's part of the read-out's inputs, in units of `Problem.scale`.
+
+    Aᵀ (n, n), Bᵀ (m, n) and r (n,) of the dynamics; L (n+m, n+m) and q (n+m,) of the cost; v (m,),
+    its multiplier ν and limits; λ (n,) of the next stage's state.
+    """
+
+    A: ca.SX
+    B: ca.SX
+    r: ca.SX
+    L: ca.SX
+    q: ca.SX
+    v: ca.SX
+    nu: ca.SX
+    lam: ca.SX
+    lower: ca.SX
+    upper: ca.SX
+
+
+def _stages(inputs: Mapping[str, ca.SX]) -> list[_Stage]:
+    """The stages 0 … N−1 of the read-out's inputs, which have them side by side."""
+    n = inputs["A"].size1()
+    m = inputs["B"].size1()
+    columns_a_stage = {"A": n, "B": n, "L": n + m}
+    parts = []
+    for name in _Stage._fields:
+        columns = columns_a_stage.get(name, 1)
+        parts.append(ca.horzsplit(inputs[name], columns))
+    return [_Stage(*stage) for stage in zip(*parts, strict=True)]
+
+
+def readout(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    prepared: StackedFunction,
+) -> StackedFunction:
     """States, slack, costates, value and residual that belong to a solution of the condensed QP.
 
     The QP and its solution are in units of `Problem.scale`, the results in the model's. The
@@ -433,83 +565,114 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     price = ca.DM(scale.state_price)
     x_s = ca.DM(problem.reference_state)
     symbols = symbolic_theta(problem, blocks)
-    given = _readout_symbols(n, m, horizon)
-    s = given["s"]
-    deviation = s - x_s
+    B_lambda = symbols["B_lambda"]
+    b_lambda = symbols["b_lambda"]
+    inputs = _readout_symbols(n, m, horizon)
+    L_N = inputs["L_N"]
+    q_N = inputs["q_N"]
+    stages = _stages(inputs)
     bounds = _SoftBounds(
         lower=(symbols["x_l"] - x_s) / state_scale,
         upper=(symbols["x_u"] - x_s) / state_scale,
         w=symbols["w_sigma"] / price,
         W=symbols["W_sigma"] * (state_scale / price),
     )
-    A = ca.horzsplit(given["A"], n)
-    B = ca.horzsplit(given["B"], n)
-    r = ca.horzsplit(given["r"])
-    L = ca.horzsplit(given["L"], n + m)
-    q = ca.horzsplit(given["q"])
-    v = ca.horzsplit(given["v"])
-    lam = ca.horzsplit(given["lam"])
 
     # Forward: states, slack and value. The penalty of s itself is that of the true bounds.
+    s = inputs["s"]
+    deviation = s - x_s
     penalty = problem.symbolic_penalty(s)
-    value = given["constant"] + penalty + symbols["c_lambda"]
-    value += ca.bilin(symbols["B_lambda"], deviation) + ca.dot(symbols["b_lambda"], deviation)
+    value = inputs["constant"] + penalty + symbols["c_lambda"]
+    value += ca.bilin(B_lambda, deviation) + ca.dot(b_lambda, deviation)
     value /= scale.cost
     xi = [deviation / state_scale]
     slack = []
-    for k in range(horizon):
-        w = ca.vertcat(xi[k], v[k])
-        value += ca.bilin(L[k], w) / 2 + ca.dot(q[k], w)
-        xi.append(A[k].T @ xi[k] + B[k].T @ v[k] + r[k])
-        above = xi[k + 1] - symbols["x_u"] / state_scale + x_s / state_scale
-        outside = ca.fmax(bounds.lower - xi[k + 1], above)
-        t = ca.fmax(outside, 0)
+    for k, stage in enumerate(stages):
+        w = ca.vertcat(xi[k], stage.v)
+        value += _quadratic(stage.L, stage.q, w)
+        next_xi = stage.A.T @ xi[k] + stage.B.T @ stage.v + stage.r
+        below = bounds.lower - next_xi
+        above = next_xi - symbols["x_u"] / state_scale + x_s / state_scale
+        t = ca.fmax(ca.fmax(below, above), 0)
+        stage_penalty = ca.dot(bounds.w, t) + ca.dot(bounds.W, t**2)
+        value += problem.discount ** (k + 1) * stage_penalty
+        xi.append(next_xi)
         slack.append(t)
-        value += problem.discount ** (k + 1) * (ca.dot(bounds.w, t) + ca.dot(bounds.W, t**2))
-    value += ca.bilin(given["L_N"], xi[horizon]) / 2 + ca.dot(given["q_N"], xi[horizon])
+    end = xi[horizon]
+    value += _quadratic(L_N, q_N, end)
 
-    # Backward: costates. That of stage 0 has the initial cost in place of a soft row.
-    chi = [given["L_N"] @ xi[horizon] + given["q_N"] + lam[horizon - 1]]
-    for k in reversed(range(horizon)):
-        w = ca.vertcat(xi[k], v[k])
-        costate = L[k][:n, :] @ w + q[k][:n] + A[k] @ chi[0]
-        if k == 0:
-            costate += (2 * symbols["B_lambda"] @ deviation + symbols["b_lambda"]) / price
-            costate += ca.gradient(penalty, s) / price
-        else:
-            costate += lam[k - 1]
-        chi.insert(0, costate)
+    # Backward: costates, from the gradient of the terminal cost to those of the initial one.
+    end_gradient = L_N @ end + q_N
+    initial_gradient = (2 * B_lambda @ deviation + b_lambda) / price
+    penalty_gradient = ca.gradient(penalty, s) / price
+    chi = _costates(stages, xi, end_gradient, [initial_gradient, penalty_gradient])
 
-    actions = given["v"] * ca.repmat(ca.DM(scale.action), 1, horizon)
+    # In the model's units.
+    action_scale = ca.repmat(ca.DM(scale.action), 1, horizon)
+    actions = inputs["v"] * action_scale
     states = [column * state_scale for column in xi]
     costates = [column * price for column in chi]
+    violations = [column * state_scale for column in slack]
+    discounts = problem.discounts[1:].tolist()
     results = {
         "xi": ca.horzcat(*states),
-        "t": ca.horzcat(*(column * state_scale for column in slack)),
+        "t": ca.horzcat(*violations),
         "chi": ca.horzcat(*costates),
         "value": value * scale.cost,
         **_shifted(problem, states, actions, costates),
-        "residual": _residual(given, xi, chi, bounds, problem.discounts[1:].tolist()),
+        "residual": _residual(stages, L_N, xi, chi, bounds, discounts),
     }
     from_preparation = ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
-    room = {
-        "f": horizon * m,
-        "row_lower": horizon * n,
-        "row_upper": horizon * n,
-        "iterations": 1,
-        "gradient": blocks.size,
-    }
+    shared = {name: prepared.part(name) for name in from_preparation}
     return StackedFunction(
         "readout",
-        {**given, "theta": symbols["theta"]},
+        {**inputs, "theta": symbols["theta"]},
         results,
-        {name: prepared.part(name) for name in from_preparation},
-        room=room,
+        shared,
+        room={
+            "f": horizon * m,
+            "row_lower": horizon * n,
+            "row_upper": horizon * n,
+            "iterations": 1,
+            "gradient": blocks.size,
+        },
     )
 
 
+def _quadratic(hessian: ca.SX, gradient: ca.SX, w: ca.SX) -> ca.SX:
+    """½wᵀHw + gᵀw."""
+    return ca.bilin(hessian, w) / 2 + ca.dot(gradient, w)
+
+
+def _costates(
+    stages: Sequence[_Stage],
+    xi: Sequence[ca.SX],
+    end_gradient: ca.SX,
+    initial_gradients: Sequence[ca.SX],
+) -> list[ca.SX]:
+    """Costates χ_0 … χ_N by the adjoint recursion, (n,) each, in units of `Problem.scale`.
+
+    The state of stage k ≥ 1 has a soft row, whose λ is that of stage k−1; that of stage 0 has the
+    initial cost in its place.
+    """
+    n = end_gradient.numel()
+    chi = [end_gradient + stages[-1].lam]
+    for k in reversed(range(len(stages))):
+        stage = stages[k]
+        w = ca.vertcat(xi[k], stage.v)
+        costate = stage.L[:n, :] @ w + stage.q[:n] + stage.A @ chi[0]
+        own_gradients = [stages[k - 1].lam] if k else initial_gradients
+        for gradient in own_gradients:
+            costate += gradient
+        chi.insert(0, costate)
+    return chi
+
+
 def _shifted(
-    problem: Problem, states: Sequence[ca.SX], actions: ca.SX, costates: Sequence[ca.SX]
+    problem: Problem,
+    states: Sequence[ca.SX],
+    actions: ca.SX,
+    costates: Sequence[ca.SX],
 ) -> dict[str, ca.SX]:
     """The next point of linearisation: the first stage dropped, the last control repeated.
 
@@ -519,8 +682,11 @@ def _shifted(
     x_s = ca.DM(problem.reference_state)
     u_s = ca.DM(problem.reference_action)
     next_states = [column + x_s for column in states[1:]]
+    # A stage that comes to weigh γᵏ⁻¹ in place of γᵏ has costates 1/γ as large.
     next_costates = [column / problem.discount for column in costates[2:]]
-    next_actions = ca.horzcat(actions[:, 1:], actions[:, -1])
+    later_actions = actions[:, 1:]
+    last_action = actions[:, -1]
+    next_actions = ca.horzcat(later_actions, last_action)
     return {
         "next_x": ca.horzcat(*next_states),
         "next_u": next_actions + ca.repmat(u_s, 1, problem.horizon),
@@ -530,7 +696,7 @@ def _shifted(
 
 def _readout_symbols(n: int, m: int, horizon: int) -> dict[str, ca.SX]:
     """Symbols of the read-out's inputs but θ, in the order in which C gives them."""
-    shapes = {
+    shapes: Shapes = {
         "s": (n, 1),
         "v": (m, horizon),
         "lam": (n, horizon),
@@ -546,11 +712,12 @@ def _readout_symbols(n: int, m: int, horizon: int) -> dict[str, ca.SX]:
         "q_N": (n, 1),
         "constant": (1, 1),
     }
-    return {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
+    return scalar_symbols(shapes)
 
 
 def _residual(
-    given: Mapping[str, ca.SX],
+    stages: Sequence[_Stage],
+    L_N: ca.SX,
     xi: Sequence[ca.SX],
     chi: Sequence[ca.SX],
     bounds: _SoftBounds,
@@ -567,45 +734,53 @@ def _residual(
     with y = ξ_{k+1}. The last is that of the soft bound Σ t + (W/w) t²; feasibility, sign and
     complementarity at once. All are zero exactly at the solution.
     """
-    m = given["v"].size1()
-    n, horizon = given["lam"].shape
-    B = ca.horzsplit(given["B"], n)
-    L = ca.horzsplit(given["L"], n + m)
+    n = L_N.size1()
+    next_weights = [stage.L[:n, :n] for stage in stages[1:]]
+    next_weights.append(L_N)
     errors = []
-    for k in range(horizon):
-        v = given["v"][:, k]
-        nu = given["nu"][:, k]
-        next_weight = given["L_N"] if k + 1 == horizon else L[k + 1][:n, :n]
-
-        cost = L[k][n:, :] @ ca.vertcat(xi[k], v) + given["q"][n:, k]
-        pull = B[k] @ chi[k + 1]
-        next_curvature = ca.fabs(ca.diag(next_weight))
+    for k, stage in enumerate(stages):
+        v = stage.v
+        nu = stage.nu
+        w = ca.vertcat(xi[k], v)
+        cost = stage.L[n:, :] @ w + stage.q[n:]
+        pull = stage.B @ chi[k + 1]
         # The curvature in v_k: of its own stage, and of the next one through the state.
-        curvature = ca.fabs(ca.diag(L[k][n:, n:])) + B[k] ** 2 @ next_curvature
-        size = ca.fabs(cost)
-        for other in (ca.fabs(pull), ca.fabs(nu), curvature):
-            size = ca.fmax(size, other)
+        own_curvature = ca.fabs(ca.diag(stage.L[n:, n:]))
+        next_curvature = ca.fabs(ca.diag(next_weights[k]))
+        curvature = own_curvature + stage.B**2 @ next_curvature
+        size = ca.fmax(ca.fabs(cost), ca.fabs(pull))
+        size = ca.fmax(size, ca.fabs(nu))
+        size = ca.fmax(size, curvature)
         size = ca.fmax(size, LEAST_SIZE)
         errors.append(ca.fabs(cost + pull + nu) / size)
 
-        shifted = v + nu / size
-        projection = ca.fmin(ca.fmax(shifted, given["lower"][:, k]), given["upper"][:, k])
+        projection = _symbolic_projection(v + nu / size, stage.lower, stage.upper)
         errors.append(ca.fabs(v - projection))
 
-        # As in `SoftQp.residual`, by the undiscounted weights.
-        y = xi[k + 1]
-        shifted = y + given["lam"][:, k] / (discounts[k] * bounds.w)
-        nearest = ca.fmin(ca.fmax(shifted, bounds.lower), bounds.upper)
-        beyond = shifted - nearest
-        violation = ca.fmax(ca.fabs(beyond) - 1, 0) / (1 + 2 * bounds.W / bounds.w)
-        proximal = nearest + ca.sign(beyond) * violation
-        errors.append(ca.fabs(y - proximal) / (1 + ca.fabs(y)))
+        relative_lam = stage.lam / (discounts[k] * bounds.w)
+        errors.append(_soft_bound_error(xi[k + 1], relative_lam, bounds))
 
-    first, *others = ca.vertsplit(ca.vertcat(*errors))
-    largest = first
-    for error in others:
+    entries = ca.vertsplit(ca.vertcat(*errors))
+    largest = entries[0]
+    for error in entries[1:]:
         largest = ca.fmax(largest, error)
     return largest
+
+
+def _symbolic_projection(values: ca.SX, lower: ca.SX, upper: ca.SX) -> ca.SX:
+    """Projection of values on the box between the limits."""
+    return ca.fmin(ca.fmax(values, lower), upper)
+
+
+def _soft_bound_error(y: ca.SX, relative_lam: ca.SX, bounds: _SoftBounds) -> ca.SX:
+    """|y − prox(y + λ/w)| / (1 + |y|) of the soft bound, as in `QpSolution.residual`."""
+    shifted = y + relative_lam
+    nearest = _symbolic_projection(shifted, bounds.lower, bounds.upper)
+    beyond = shifted - nearest
+    charged = ca.fmax(ca.fabs(beyond) - 1, 0)
+    violation = charged / (1 + 2 * bounds.W / bounds.w)
+    proximal = nearest + ca.sign(beyond) * violation
+    return ca.fabs(y - proximal) / (1 + ca.fabs(y))
 
 
 @dataclass(frozen=True)
@@ -625,7 +800,9 @@ class Spectrum:
         """Whether an eigenvalue is so close to the floor that the lift has a kink there."""
         # At the floor itself the lift has a kink, and its derivative is one-sided.
         distance = np.abs(self.values - self.floor)
-        return bool((distance < tolerance * np.maximum(1.0, np.abs(self.values))).any())
+        size = np.maximum(1.0, np.abs(self.values))
+        at_floor = distance < tolerance * size
+        return bool(at_floor.any())
 
     def contract(self, seed: Vector) -> Vector:
         """Adjoint of the derivative of L = P(·): M with ⟨seed, dL⟩ = ⟨M, dX⟩, shapes (N, s, s).
@@ -633,17 +810,21 @@ class Spectrum:
         L, X and the seed are in the model's units. The derivative of a spectral function is a
         Schur product with its divided differences in the eigenbasis (Daleckii and Krein).
         """
-        metric = np.outer(self.ranges, self.ranges)
-        lifted = np.maximum(self.values, self.floor)
-        unlifted = (self.values > self.floor).astype(float)
+        values = self.values
+        lifted = np.maximum(values, self.floor)
+        unlifted = (values > self.floor).astype(float)
 
         # Divided differences (P(a) − P(b)) / (a − b); of equal eigenvalues the derivative of P.
-        gap = self.values[:, :, None] - self.values[:, None, :]
+        gap = values[:, :, None] - values[:, None, :]
         rise = lifted[:, :, None] - lifted[:, None, :]
-        slope = unlifted[:, :, None] * unlifted[:, None, :]
-        same = np.abs(gap) < 1e-12 * np.maximum(1.0, np.abs(self.values).max())
-        divided = np.where(same, slope, rise / np.where(same, 1, gap))
+        derivative = unlifted[:, :, None] * unlifted[:, None, :]
+        size = np.maximum(1.0, np.abs(values).max())
+        same = np.abs(gap) < 1e-12 * size
+        divisor = np.where(same, 1, gap)
+        divided = np.where(same, derivative, rise / divisor)
 
+        # Seed and result are in the model's units, the eigenvectors in those of `ranges`.
+        metric = np.outer(self.ranges, self.ranges)
         transposed = self.vectors.transpose(0, 2, 1)
         in_eigenbasis = transposed @ (seed / metric) @ self.vectors
         product = self.vectors @ (divided * in_eigenbasis) @ transposed
@@ -664,28 +845,40 @@ class GaussNewton:
     lifts = False
     spectrum: Spectrum | None = None
 
-    def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        blocks: ThetaBlocks,
+        prepared: StackedFunction,
+    ) -> None:
+        horizon = problem.horizon
         width = problem.n_states + problem.n_actions
         self.functions: dict[str, StackedFunction] = {}
         self.discounts = problem.discounts[:-1]
         self._end_discount = float(problem.discounts[-1])
         scale = problem.scale
+        # A derivative by scaled variables has their scales as factors.
         self.bend = np.outer(scale.both, scale.both) / scale.cost
         self.slope = scale.both / scale.cost
         # Views of the preparation's memory: what is written to them is in the QP.
-        self.L = prepared.inputs["L"].reshape(problem.horizon, width, width)
-        self.q = prepared.inputs["q"].reshape(problem.horizon, width)
+        self.L = prepared.inputs["L"].reshape(horizon, width, width)
+        self.q = prepared.inputs["q"].reshape(horizon, width)
         self._L_N = prepared.inputs["L_N"]
         self._q_N = prepared.inputs["q_N"]
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over a new θ: its costs, which no linearisation point changes here."""
-        n = self._q_N.size
-        self.L[:] = 2 * self.discounts[:, None, None] * parameters["B_l"] * self.bend
+        # wᵀB w has the Hessian 2B.
+        hessian_weights = 2 * self.discounts[:, None, None]
+        self.L[:] = hessian_weights * parameters["B_l"] * self.bend
         self.q[:] = self.discounts[:, None] * parameters["b_l"] * self.slope
-        terminal = 2 * self._end_discount * parameters["B_Vf"] * self.bend[:n, :n]
+
+        n = self._q_N.size
+        state_bend = self.bend[:n, :n]
+        state_slope = self.slope[:n]
+        terminal = 2 * self._end_discount * parameters["B_Vf"] * state_bend
         self._L_N[:] = terminal.reshape(-1)
-        self._q_N[:] = self._end_discount * parameters["b_Vf"] * self.slope[:n]
+        self._q_N[:] = self._end_discount * parameters["b_Vf"] * state_slope
 
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write L and q for a point of linearisation.
@@ -715,11 +908,17 @@ class Exact(GaussNewton):
     source = "exact.h"
     FLOOR = 1e-3
 
-    def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        blocks: ThetaBlocks,
+        prepared: StackedFunction,
+    ) -> None:
         super().__init__(problem, blocks, prepared)
         self.lifts = True
         self._reference = problem.reference
         self._ranges = problem.scale.ranges
+        # Over the ranges, and relative to the level of the cost, eigenvalues have no unit.
         self.metric = np.outer(self._ranges, self._ranges) / problem.scale.level
         self._curvature = _curvature_by_stage(problem, blocks)
         self.functions["CURVATURE"] = self._curvature
@@ -734,12 +933,14 @@ class Exact(GaussNewton):
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write the convexified blocks and the gradients that go with them; see `GaussNewton`."""
         curvature = self._curvature
+        # The curvature of the dynamics along χ̄, at the point of linearisation.
         curvature.inputs["x"][:] = x.reshape(-1)
         curvature.inputs["u"][:] = u.reshape(-1)
         curvature.inputs["guess"][:] = costates.reshape(-1)
         curvature()
+        D = curvature.part("D").reshape(self.L.shape)
         discounts = self.discounts
-        blocks = 2 * discounts[:, None, None] * self._B + curvature.part("D").reshape(self.L.shape)
+        blocks = 2 * discounts[:, None, None] * self._B + D
         if not np.isfinite(blocks).all():
             # The controller refuses the QP; an eigenvalue solver would raise its own error.
             self.L[:] = np.nan
@@ -752,11 +953,13 @@ class Exact(GaussNewton):
         # The cost is expanded about the point of linearisation: its gradient there is that of ℓ_θ,
         # and the QP's variables are deviations from the reference.
         point = np.concatenate([x, u], axis=1) - self._reference
-        curved = np.einsum("kij,kj->ki", blocks, point)
-        flat = 2 * discounts[:, None] * (point @ self._B)
+        by_blocks = np.einsum("kij,kj->ki", blocks, point)
+        by_cost = 2 * discounts[:, None] * (point @ self._B)
+        gradient = by_cost + discounts[:, None] * self._b - by_blocks
         self.L[:] = blocks * self.bend
-        self.q[:] = (flat + discounts[:, None] * self._b - curved) * self.slope
-        return float((point * (curved - flat)).sum() / 2)
+        self.q[:] = gradient * self.slope
+        constant = (point * (by_blocks - by_cost)).sum() / 2
+        return float(constant)
 
     def _lift(self, blocks: Vector) -> Vector:
         """What lifts the eigenvalues of blocks (N, n+m, n+m) to the floor; keeps their spectrum."""
@@ -765,7 +968,9 @@ class Exact(GaussNewton):
         self.spectrum = Spectrum(values, vectors, floor, self._ranges)
         # What is to be lifted is added: what is above the floor keeps its digits.
         rise = np.maximum(floor - values, 0.0)
-        lift = (vectors * rise[:, None, :]) @ vectors.transpose(0, 2, 1) / self.metric
+        raised_vectors = vectors * rise[:, None, :]
+        transposed = vectors.transpose(0, 2, 1)
+        lift = raised_vectors @ transposed / self.metric
         return np.asarray(lift)
 
 
@@ -781,14 +986,17 @@ def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> StackedFunctio
         {"x": x, "u": u, "chi": chi, "theta": symbols["theta"]},
         {"D": _curvature(problem, symbols, x, u, chi)},
     )
-    arguments = {
-        "x": ca.MX.sym("x", n, horizon),
-        "u": ca.MX.sym("u", m, horizon),
-        "guess": ca.MX.sym("guess", n, horizon),
-        "theta": ca.MX.sym("theta", blocks.size),
-    }
+    arguments = matrix_symbols(
+        {
+            "x": (n, horizon),
+            "u": (m, horizon),
+            "guess": (n, horizon),
+            "theta": (blocks.size, 1),
+        }
+    )
     theta = ca.repmat(arguments["theta"], 1, horizon)
-    D = stage.map(horizon)(arguments["x"], arguments["u"], arguments["guess"], theta)
+    stages = stage.map(horizon)
+    D = stages(arguments["x"], arguments["u"], arguments["guess"], theta)
     return StackedFunction("curvature", arguments, {"D": D})
 
 
@@ -806,10 +1014,12 @@ class SampleFunctions:
     def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
         if hessian not in HESSIANS:
             raise ControllerError(f"there is no Hessian '{hessian}'{instead(hessian, HESSIANS)}")
+        # First of all, since a model that is too stiff makes no controller.
         self.integration = check_integration(problem)
         self.problem = problem
         self.blocks = blocks
         self.preparation = preparation(problem, blocks)
+        # The read-out and the embedding read what the preparation writes.
         self.readout = readout(problem, blocks, self.preparation)
         self.embedding = embedding(problem, blocks, self.preparation, self.readout)
         self.hessian = HESSIANS[hessian](problem, blocks, self.preparation)

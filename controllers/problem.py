@@ -45,25 +45,34 @@ class Units:
     def from_problem(cls, problem: Problem) -> Units:
         """Units of a problem; raises ModelError where the multipliers cannot be computed."""
         n = problem.n_states
-        powers = np.rint(_power(problem.upper - problem.lower))
-        both = np.array([10.0**power for power in powers])
         # The units of states and actions are the powers of ten nearest to their bounds' widths.
+        widths = problem.upper - problem.lower
+        powers = np.rint(_power(widths))
+        both = np.array([10.0**power for power in powers])
         sizes = _cost_sizes(problem, both)
         cost = 1.0
         if sizes:  # the first one is what the cost is counted in
             first = next(iter(sizes.values()))
-            cost = float(10.0 ** (np.floor(_power(first)) + 1))
-        return cls(both[:n], both[n:], cost, sizes.get("multiplier", 0.0))
+            power_above = np.floor(_power(first)) + 1
+            cost = float(10.0**power_above)
+        return cls(
+            state=both[:n],
+            action=both[n:],
+            cost=cost,
+            largest_multiplier=sizes.get("multiplier", 0.0),
+        )
 
     def exact_penalty_weights(self) -> Vector:
         """Slack weights just above the multipliers, to two digits, (n,): the least exact ones.
 
         Where no bound is active any positive ones are: a thousandth of κ/ρ_x.
         """
-        if not self.largest_multiplier:
+        largest = self.largest_multiplier
+        if not largest:
             return 1e-3 * self.cost / self.state
-        digit = 10.0 ** (np.floor(_power(self.largest_multiplier)) - 1)
-        rounded_up = (np.floor(self.largest_multiplier / digit) + 1) * digit
+        second_power = np.floor(_power(largest)) - 1
+        digit = 10.0**second_power
+        rounded_up = (np.floor(largest / digit) + 1) * digit
         return np.asarray(rounded_up / self.state)
 
 
@@ -101,9 +110,17 @@ class Scale:
             sizes = {}
         level = next(iter(sizes.values()), 1.0)
         # Powers of two, so that scaling rounds nothing; limits keep products of scales finite.
-        both = 2.0 ** np.rint(np.log2(np.clip(ranges, 1e-50, 1e50)))
-        cost = 4.0 ** np.rint(np.log2(np.clip(level, 1e-100, 1e100)) / 2)
-        return cls(both[:n], both[n:], float(cost), ranges, level)
+        range_powers = np.log2(np.clip(ranges, 1e-50, 1e50))
+        both = 2.0 ** np.rint(range_powers)
+        cost_power = np.log2(np.clip(level, 1e-100, 1e100))
+        cost = 4.0 ** np.rint(cost_power / 2)
+        return cls(
+            state=both[:n],
+            action=both[n:],
+            cost=float(cost),
+            ranges=ranges,
+            level=level,
+        )
 
     @property
     def both(self) -> Vector:
@@ -135,35 +152,40 @@ def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
     below = reference <= problem.lower + near
     above = reference >= problem.upper - near
     bound_multipliers = multipliers(gradient * both, rates * both, below, above)
-    curved = np.nan_to_num(np.abs(curvature * both**2), posinf=0.0)
+    # Over a step of each variable, so that all sizes are costs.
+    second_order = np.abs(curvature * both**2)
     sizes = {
         "multiplier": float(bound_multipliers[:n].max()),
-        "curvature": float(curved.max()),
+        "curvature": float(np.nan_to_num(second_order, posinf=0.0).max()),
         "cost": abs(problem.reference_cost),
     }
     # A size below rounding counts as zero.
-    least = np.finfo(np.float64).eps ** 0.5 * max(sizes.values())
+    rounding = np.finfo(np.float64).eps ** 0.5
+    least = rounding * max(sizes.values())
     return {name: size for name, size in sizes.items() if size > least}
 
 
 def _derivatives_at_reference(problem: Problem) -> tuple[Vector, Vector, Matrix]:
     """∇ℓ (n+m,), the diagonal of ∇²ℓ (n+m,), and ∂x' (n, n+m), by (x, u) at the reference."""
     model = problem.model
-    x, u, d, p = model.symbols()
+    symbols = model.symbols()
+    x, u, _, _ = symbols
     w = ca.vertcat(x, u)
-    hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
-    rates = ca.jacobian(model.ode(x, u, d, p), w)
-    function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
-    slope, curvature, jacobian = function(
-        problem.reference_state,
-        problem.reference_action,
-        model.nominal_disturbance,
-        model.nominal_parameters,
-    )
-    return slope.full().reshape(-1), curvature.full().reshape(-1), jacobian.full()
+    cost = ca.SX(model.economic_cost(*symbols))
+    hessian, gradient = ca.hessian(cost, w)
+    jacobian = ca.jacobian(model.ode(*symbols), w)
+    function = ca.Function("d", list(symbols), [gradient, ca.diag(hessian), jacobian])
+    values = function(*problem.nominal_point)
+    slope, curvature, rates = (value.full() for value in values)
+    return slope.reshape(-1), curvature.reshape(-1), rates
 
 
-def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
+def multipliers(
+    gradient: Vector,
+    rates: Vector,
+    below: Mask,
+    above: Mask,
+) -> Vector:
     """|μ| of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs.
 
     They come from the QP min ½|w|² + ∇ℓᵀw under the equation ∂x' w = 0 and the active bounds.
@@ -180,22 +202,32 @@ def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Ve
     Raises:
         ModelError: DAQP finds none.
     """
+    n_bounds = gradient.size
     size = np.abs(gradient).max()
-    if not size or not (np.isfinite(gradient).all() and np.isfinite(rates).all()):
-        return np.zeros(gradient.size)
+    # Without a gradient nothing pushes; what is not finite is reported elsewhere.
+    finite = np.isfinite(gradient).all() and np.isfinite(rates).all()
+    if not size or not finite:
+        return np.zeros(n_bounds)
+
     # An equation may be multiplied by any number: in rows of size 1 DAQP's tolerances mean what
     # they say.
     row_sizes = np.abs(rates).max(axis=1, keepdims=True)
     rows = rates / np.maximum(row_sizes, np.finfo(np.float64).tiny)
-    bounds = gradient.size
-    equations = len(rates)
+
+    # DAQP's limits are those of the variables, then those of the rows, which are equations.
+    n_equations = len(rates)
+    zeros = np.zeros(n_equations)
+    upper = np.concatenate([np.where(above, 0.0, np.inf), zeros])
+    lower = np.concatenate([np.where(below, 0.0, -np.inf), zeros])
+    sense = np.zeros(n_bounds + n_equations, dtype=np.int32)
+    sense[n_bounds:] = DAQP_FIXED
     _, _, flag, info = daqp.solve(
-        np.eye(bounds),
+        np.eye(n_bounds),
         gradient / size,
         rows,
-        np.concatenate([np.where(above, 0.0, np.inf), np.zeros(equations)]),
-        np.concatenate([np.where(below, 0.0, -np.inf), np.zeros(equations)]),
-        np.repeat(np.array([0, DAQP_FIXED], dtype=np.int32), [bounds, equations]),
+        upper,
+        lower,
+        sense,
         **DAQP_SETTINGS,
     )
     if flag <= 0:
@@ -203,17 +235,19 @@ def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Ve
             "problem: the multipliers of the bounds at the reference cannot be computed "
             f"({DAQP_STATUS.get(flag, flag)}); look at the derivatives of cost and model there"
         )
-    return np.asarray(np.abs(info["lam"][:bounds]) * size)
+    bound_multipliers = np.abs(info["lam"][:n_bounds])
+    return np.asarray(bound_multipliers * size)
 
 
 def _power(size: ArrayLike) -> Vector:
     """log10 of positive sizes, kept where products of the units are finite."""
-    return np.asarray(np.clip(np.log10(size), -50.0, 50.0))
+    power = np.log10(size)
+    return np.asarray(np.clip(power, -50.0, 50.0))
 
 
 def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
+    """A copy that cannot be written to: a frozen problem stays as it was checked."""
     try:
-        # A copy that cannot be written to: a frozen problem stays as it was checked.
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ModelError(f"problem: {name} holds no numbers: {values!r}") from error
@@ -275,11 +309,16 @@ class Problem:
     def __post_init__(self) -> None:
         for name in VECTORS:
             size = self.n_actions if "action" in name else self.n_states
-            object.__setattr__(self, name, _frozen(name, getattr(self, name), size))
+            vector = _frozen(name, getattr(self, name), size)
+            object.__setattr__(self, name, vector)
         for kind in ("state", "action"):
-            if not (getattr(self, f"{kind}_lower") < getattr(self, f"{kind}_upper")).all():
+            lower = getattr(self, f"{kind}_lower")
+            upper = getattr(self, f"{kind}_upper")
+            if not (lower < upper).all():
                 raise ModelError(f"problem: {kind}_lower must be below {kind}_upper everywhere")
-        if (self.penalty_linear <= 0).any() or (self.penalty_quadratic <= 0).any():
+        # A slack without a price would be free, and one without curvature makes the QP degenerate.
+        weights = np.concatenate([self.penalty_linear, self.penalty_quadratic])
+        if (weights <= 0).any():
             raise ModelError("problem: penalty_linear and penalty_quadratic must be positive")
         if self.horizon < 1 or not 0 < self.discount <= 1:
             raise ModelError(
@@ -297,24 +336,23 @@ class Problem:
 
     def _check_reference(self) -> None:
         """Raise ModelError unless the model has finite values and derivatives at the reference."""
-        model, n = self.model, self.n_states
-        x, u, d, p = model.symbols()
+        model = self.model
+        n = self.n_states
+        symbols = model.symbols()
+        x, u, _, _ = symbols
         point = ca.vertcat(x, u)
         results = []
         for function in (model.ode, model.economic_cost):
-            value = ca.SX(function(x, u, d, p))
-            results += [value, ca.jacobian(value, point)]
+            value = ca.SX(function(*symbols))
+            results.append(value)
+            results.append(ca.jacobian(value, point))
         # Evaluated once: a value that is not finite would else appear in the first QP, far from its
         # cause.
-        evaluate = ca.Function("at_reference", [x, u, d, p], results)
-        values = evaluate(
-            self.reference_state,
-            self.reference_action,
-            model.nominal_disturbance,
-            model.nominal_parameters,
-        )
+        evaluate = ca.Function("at_reference", list(symbols), results)
+        values = evaluate(*self.nominal_point)
         rate, rates, cost, slope = (value.full() for value in values)
-        names = [quantity.name for quantity in (*model.states, *model.actions)]
+        quantities = (*model.states, *model.actions)
+        names = [quantity.name for quantity in quantities]
         for i in range(n):
             self._require_finite(f"ode(x, u, d, p): d/dt {names[i]}", rate[i, 0])
         for i in range(n):
@@ -331,8 +369,9 @@ class Problem:
         if np.isfinite(value):
             return
         model = self.model
+        quantities = (*model.states, *model.actions)
         point = []
-        for quantity, entry in zip((*model.states, *model.actions), self.reference, strict=True):
+        for quantity, entry in zip(quantities, self.reference, strict=True):
             point.append(f"{quantity.name} = {float(entry):g}")
         raise ModelError(
             f"model '{model.name}', {what} is {value} at the reference ({', '.join(point)}), "
@@ -356,6 +395,16 @@ class Problem:
         return np.concatenate([self.reference_state, self.reference_action])
 
     @property
+    def nominal_point(self) -> tuple[Vector, Vector, Vector, Vector]:
+        """Arguments (x, u, d, p) of the model's functions at the reference, all nominal."""
+        return (
+            self.reference_state,
+            self.reference_action,
+            self.model.nominal_disturbance,
+            self.model.nominal_parameters,
+        )
+
+    @property
     def lower(self) -> Vector:
         """Lower bounds of (x, u), shape (n+m,)."""
         return np.concatenate([self.state_lower, self.action_lower])
@@ -369,14 +418,21 @@ class Problem:
     def penalty(self) -> Penalty:
         """Penalty of a state by the true bounds."""
         return Penalty(
-            self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
+            self.state_lower,
+            self.state_upper,
+            self.penalty_linear,
+            self.penalty_quadratic,
         )
 
     def symbolic_penalty(self, s: ca.SX) -> ca.SX:
         """The penalty of the true bounds as a CasADi expression of a state (n,)."""
         # At most one of the two bounds is violated, so the larger excess is the violation.
-        violation = ca.fmax(ca.fmax(self.state_lower - s, s - self.state_upper), 0)
-        return ca.dot(self.penalty_linear, violation) + ca.dot(self.penalty_quadratic, violation**2)
+        below = self.state_lower - s
+        above = s - self.state_upper
+        violation = ca.fmax(ca.fmax(below, above), 0)
+        linear = ca.dot(self.penalty_linear, violation)
+        quadratic = ca.dot(self.penalty_quadratic, violation**2)
+        return linear + quadratic
 
     @cached_property
     def discounts(self) -> Vector:
@@ -385,7 +441,8 @@ class Problem:
         NumPy's power differs in the last bit between processors, and with it all that is keyed by
         the generated C; Python's is the C library's.
         """
-        return np.array([self.discount**k for k in range(self.horizon + 1)])
+        powers = [self.discount**k for k in range(self.horizon + 1)]
+        return np.array(powers)
 
     @cached_property
     def units(self) -> Units:
@@ -402,9 +459,11 @@ class Problem:
 
         `discount` γ is the problem's own where None.
         """
-        # At γ = 1 the level of the value has no meaning; any finite one serves.
         gamma = self.discount if discount is None else discount
-        return self.reference_cost / (1 - gamma) if gamma < 1 else self.reference_cost
+        # At γ = 1 the level of the value has no meaning; any finite one serves.
+        if not gamma < 1:
+            return self.reference_cost
+        return self.reference_cost / (1 - gamma)
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Problem:
@@ -471,11 +530,13 @@ class DisturbanceLaw:
             Disturbances in the model's units, (count, n_d).
         """
         size = (count, len(self.nominal))
+        if self.kind == "none":
+            return np.tile(self.nominal, (count, 1))
         if self.kind == "uniform":
-            return self.nominal + self.ranges * generator.uniform(-1.0, 1.0, size)
-        if self.kind == "normal":
-            return self.nominal + self.ranges * generator.standard_normal(size)
-        return np.tile(self.nominal, (count, 1))
+            unit = generator.uniform(-1.0, 1.0, size)
+        else:
+            unit = generator.standard_normal(size)
+        return self.nominal + self.ranges * unit
 
 
 NAME_THE_MODEL = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
@@ -502,6 +563,7 @@ class PlantProblem:
         if plant.model is not None:
             problem = replace(problem, model=load_model(plant.model))
         model = problem.model
+        # The optimum is that of the plant only if both mean the same, in the same order.
         needed = "the optimum needs a model of the plant"
         for kind in ("states", "actions", "disturbances"):
             ours = [quantity.name for quantity in getattr(model, kind)]
@@ -512,8 +574,14 @@ class PlantProblem:
                     f"{', '.join(theirs)}; {NAME_THE_MODEL}"
                 )
         # What the scenario does not say is the model's: its nominal disturbances, without noise.
-        nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
-        ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
+        nominal = model.nominal_disturbance
+        if len(table.nominal):
+            nominal = np.array(table.nominal)
+        ranges = np.zeros(len(nominal))
+        if len(table.ranges):
+            ranges = np.array(table.ranges)
+        law = DisturbanceLaw(table.law, nominal, ranges)
+
         # The plant's parameters are the model's nominal ones, where the scenario does not set them.
         parameters = {quantity.name: quantity.nominal for quantity in model.parameters}
         for name, value in plant.parameters.items():
@@ -524,5 +592,5 @@ class PlantProblem:
                     "shapes the noise, name it in plant.mapping.ranges and set disturbance.ranges"
                 )
             parameters[name] = value
-        law = DisturbanceLaw(table.law, nominal, ranges)
-        return cls(problem, law, np.array([*parameters.values()], dtype=np.float64))
+        values = np.array(list(parameters.values()), dtype=np.float64)
+        return cls(problem, law, values)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 
 
+LEAST_SIZE = 1e-30
+"""What a size is at least, so that it can divide."""
 NOT_CONVEX = "not convex"
 """Status of the QpError of a QP whose Hessian is not positive definite."""
 
@@ -84,28 +86,37 @@ class QpSolution(NamedTuple):
         complementarity at once. A change of the cost's unit does not change it.
         """
         v = self.v
+        nu = self.nu
         curvature = qp.H @ v
         pull = self.lam @ qp.rows
         y = qp.rows @ v
 
-        terms = np.abs(np.array([qp.f, curvature, pull, self.nu, qp.H.diagonal()]))
-        sizes = np.maximum(terms.max(axis=0), 1e-30)
-        stationarity = np.abs(curvature + qp.f + self.nu + pull) / sizes
+        terms = np.array([qp.f, curvature, pull, nu, qp.H.diagonal()])
+        sizes = np.abs(terms).max(axis=0)
+        sizes = np.maximum(sizes, LEAST_SIZE)
+        gradient = curvature + qp.f + nu + pull
+        stationarity = np.abs(gradient) / sizes
 
         # (v, ν) is optimal in the bounds exactly where v is the projection of v + ν/σ on them.
-        projection = np.minimum(np.maximum(v + self.nu / sizes, qp.lower), qp.upper)
+        projection = _projected(v + nu / sizes, qp.lower, qp.upper)
         bounds = np.abs(v - projection)
 
         # The proximal operator of the soft bound: within the limits nothing is charged; one unit
         # of λ/w beyond them stays at the limit, and what is further out is violated.
         shifted = y + self.lam / qp.w
-        nearest = np.minimum(np.maximum(shifted, qp.row_lower), qp.row_upper)
+        nearest = _projected(shifted, qp.row_lower, qp.row_upper)
         beyond = shifted - nearest
-        violation = np.maximum(np.abs(beyond) - 1.0, 0.0) / (1 + 2 * qp.W / qp.w)
+        charged = np.maximum(np.abs(beyond) - 1.0, 0.0)
+        violation = charged / (1 + 2 * qp.W / qp.w)
         proximal = nearest + np.copysign(violation, beyond)
         rows = np.abs(y - proximal) / (1 + np.abs(y))
 
-        return float(max(stationarity.max(), bounds.max(), rows.max(initial=0.0)))
+        largest = max(
+            stationarity.max(),
+            bounds.max(),
+            rows.max(initial=0.0),
+        )
+        return float(largest)
 
     def weakly_active(self, qp: SoftQp, tolerance: float = 2e-8) -> bool:
         """Whether some bound or row is about to change its activity.
@@ -122,24 +133,32 @@ class QpSolution(NamedTuple):
         Returns:
             True where a derivative of the solution is one-sided.
         """
+        v = self.v
         curvature = float(qp.H.diagonal().max())
         free = qp.lower != qp.upper
 
-        small = tolerance * max(curvature, float(np.abs(self.nu).max()))
-        distance = np.minimum(self.v - qp.lower, qp.upper - self.v)
-        at_bound = distance < tolerance * (1 + np.abs(self.v))
-        if (free & at_bound & (np.abs(self.nu) < small)).any():
+        # A variable is about to leave its bound: it is there, and ν is zero.
+        nu_size = np.abs(self.nu)
+        distance = np.minimum(v - qp.lower, qp.upper - v)
+        at_bound = distance < tolerance * (1 + np.abs(v))
+        no_push = nu_size < tolerance * max(curvature, float(nu_size.max()))
+        leaves_bound = free & at_bound & no_push
+        if leaves_bound.any():
             return True
 
-        y = qp.rows @ self.v
-        distance = np.minimum(np.abs(y - qp.row_lower), np.abs(y - qp.row_upper))
-        at_limit = distance < tolerance * (1 + np.abs(y))
-        size = np.abs(self.lam)
         # Two events: the row leaves its limit (λ = 0), or it begins to be violated (|λ| = w).
-        leaving = size < tolerance * np.maximum(curvature, size.max(initial=0.0))
-        yielding = np.abs(size - qp.w) < tolerance * qp.w
-        movable = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0) > 0
-        return bool((at_limit & (leaving | yielding | ~movable)).any())
+        y = qp.rows @ v
+        to_lower = np.abs(y - qp.row_lower)
+        to_upper = np.abs(y - qp.row_upper)
+        at_limit = np.minimum(to_lower, to_upper) < tolerance * (1 + np.abs(y))
+        lam_size = np.abs(self.lam)
+        largest = np.maximum(curvature, lam_size.max(initial=0.0))
+        leaving = lam_size < tolerance * largest
+        yielding = np.abs(lam_size - qp.w) < tolerance * qp.w
+        effect = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0)
+        unmoved = ~(effect > 0)
+        changes = at_limit & (leaving | yielding | unmoved)
+        return bool(changes.any())
 
     def active(self, qp: SoftQp) -> ActiveSet:
         """The active set: variables at a bound, rows at a limit, rows violated.
@@ -148,15 +167,20 @@ class QpSolution(NamedTuple):
         multiplier, relative to the curvature H_jj or to w, the larger decides, which is unsafe
         where `weakly_active`.
         """
-        push = np.abs(self.nu) / np.maximum(np.abs(qp.H.diagonal()), 1e-30)
-        distance = np.minimum(self.v - qp.lower, qp.upper - self.v)
-        at_bound = (qp.lower == qp.upper) | (distance < push)
+        v = self.v
+        curvature = np.abs(qp.H.diagonal())
+        push = np.abs(self.nu) / np.maximum(curvature, LEAST_SIZE)
+        distance = np.minimum(v - qp.lower, qp.upper - v)
+        fixed = qp.lower == qp.upper
+        at_bound = fixed | (distance < push)
 
-        y = qp.rows @ self.v
+        # λ/w is 0 within the limits, between 0 and 1 at one, above 1 beyond it.
+        y = qp.rows @ v
         size = np.abs(self.lam) / qp.w
         outside = np.maximum(qp.row_lower - y, y - qp.row_upper)
-        violated = size + outside > 1
-        at_limit = ~violated & (size + outside > 0)
+        shifted = size + outside
+        violated = shifted > 1
+        at_limit = ~violated & (shifted > 0)
         return ActiveSet(at_bound, at_limit, violated)
 
     def licq_margin(self, qp: SoftQp) -> float:
@@ -165,13 +189,22 @@ class QpSolution(NamedTuple):
         Zero means that the linear independence constraint qualification fails.
         """
         active = self.active(qp)
-        gradients = qp.rows[active.at_limit][:, ~active.at_bound]
-        if gradients.shape[0] == 0:
+        free = ~active.at_bound
+        gradients = qp.rows[active.at_limit][:, free]
+        n_rows, n_free = gradients.shape
+        if n_rows == 0:
             return np.inf
-        if gradients.shape[0] > gradients.shape[1]:
+        if n_rows > n_free:
             return 0.0
-        norms = np.maximum(np.linalg.norm(gradients, axis=1, keepdims=True), 1e-300)
-        return float(np.linalg.svd(gradients / norms, compute_uv=False)[-1])
+        norms = np.linalg.norm(gradients, axis=1, keepdims=True)
+        normalised = gradients / np.maximum(norms, 1e-300)
+        singular_values = np.linalg.svd(normalised, compute_uv=False)
+        return float(singular_values[-1])
+
+
+def _projected(values: Vector, lower: Vector, upper: Vector) -> Vector:
+    """Projection of values on the box between the limits."""
+    return np.minimum(np.maximum(values, lower), upper)
 
 
 KINK_TOLERANCE = 1e-8
@@ -179,7 +212,10 @@ KINK_TOLERANCE = 1e-8
 
 
 def multipliers_at_kink(
-    qp: SoftQp, solution: QpSolution, lower: Vector, upper: Vector
+    qp: SoftQp,
+    solution: QpSolution,
+    lower: Vector,
+    upper: Vector,
 ) -> QpSolution:
     """Of all multipliers of Q(s, a) at a kink, those that make dQ/da as small as they can.
 
@@ -202,31 +238,38 @@ def multipliers_at_kink(
     n = qp.w.size * m // solution.v.size
     action = solution.v[:m]
     first_rows = qp.rows[:n, :m]
-    y = first_rows @ action
-    below = np.abs(y - qp.row_lower[:n])
-    above = np.abs(y - qp.row_upper[:n])
-    near = np.minimum(below, above) < KINK_TOLERANCE * (1 + np.abs(y))
+    x_1 = first_rows @ action
+    to_lower = np.abs(x_1 - qp.row_lower[:n])
+    to_upper = np.abs(x_1 - qp.row_upper[:n])
+    near = np.minimum(to_lower, to_upper) < KINK_TOLERANCE * (1 + np.abs(x_1))
     if not near.any():
         return solution
 
-    kinked = first_rows[near]
-    width = KINK_TOLERANCE * (1 + np.abs(action))
-    inside = (action > lower + width) & (action < upper - width)
     # ν + Γᵀλ is fixed by stationarity; what the rows do not take, −ν, is dQ/da.
-    total = solution.nu[:m] + solution.lam[:n][near] @ kinked
-    least_squares = np.linalg.lstsq(kinked[:, inside].T, total[inside])[0]
-
-    w = qp.w[:n][near]
-    at_upper = (above < below)[near]
+    kinked_rows = first_rows[near]
     nu = solution.nu.copy()
     lam = solution.lam.copy()
-    lam[:n][near] = np.clip(least_squares, np.where(at_upper, 0, -w), np.where(at_upper, w, 0))
-    nu[:m] = total - lam[:n][near] @ kinked
+    total = nu[:m] + lam[:n][near] @ kinked_rows
+    width = KINK_TOLERANCE * (1 + np.abs(action))
+    inside = (action > lower + width) & (action < upper - width)
+    wanted, *_ = np.linalg.lstsq(kinked_rows[:, inside].T, total[inside])
+
+    # λ is in [0, w] at an upper limit, in [−w, 0] at a lower one.
+    w = qp.w[:n][near]
+    at_upper = (to_upper < to_lower)[near]
+    lam_least = np.where(at_upper, 0, -w)
+    lam_most = np.where(at_upper, w, 0)
+    chosen = np.clip(wanted, lam_least, lam_most)
+    lam[:n][near] = chosen
+    nu[:m] = total - chosen @ kinked_rows
     return QpSolution(solution.v, nu, lam)
 
 
 def kkt_solve(
-    qp: SoftQp, active: ActiveSet, seeds: Matrix, limits: Matrix
+    qp: SoftQp,
+    active: ActiveSet,
+    seeds: Matrix,
+    limits: Matrix,
 ) -> tuple[Matrix, Matrix]:
     """Solve the KKT system of an active set for several right-hand sides, one a row.
 
@@ -243,37 +286,40 @@ def kkt_solve(
         The variables (k, d), and the multipliers of the rows at their limit (k, c), zero elsewhere.
     """
     free = ~active.at_bound
-    H = qp.H[free][:, free]
     rows = qp.rows[:, free]
-    equal = rows[active.at_limit]
-    outside = rows[active.violated]
-    size = len(H)
-    count = len(equal)
+    equality_rows = rows[active.at_limit]
+    violated_rows = rows[active.violated]
+    H = qp.H[free][:, free]
+    if len(violated_rows):
+        W = qp.W[active.violated]
+        H = H + 2 * (violated_rows.T * W) @ violated_rows
 
-    # Column-major, as LAPACK wants it.
-    kkt = np.zeros((size + count, size + count), order="F")
-    kkt[:size, :size] = H
-    if len(outside):
-        kkt[:size, :size] += 2 * (outside.T * qp.W[active.violated]) @ outside
-    kkt[:size, size:] = equal.T
-    kkt[size:, :size] = equal
-    right = np.empty((size + count, len(seeds)), order="F")
-    right[:size] = seeds[:, free].T
-    right[size:] = limits[:, active.at_limit].T
+    # [H Γᵀ; Γ 0] for the free variables and the rows at their limit; column-major, as LAPACK
+    # wants it.
+    n_free = len(H)
+    size = n_free + len(equality_rows)
+    kkt = np.zeros((size, size), order="F")
+    kkt[:n_free, :n_free] = H
+    kkt[:n_free, n_free:] = equality_rows.T
+    kkt[n_free:, :n_free] = equality_rows
+    right = np.empty((size, len(seeds)), order="F")
+    right[:n_free] = seeds[:, free].T
+    right[n_free:] = limits[:, active.at_limit].T
 
     answer = right
-    if len(kkt):  # every variable may be at a bound
+    if size:  # every variable may be at a bound
         # SciPy is imported where it is needed: it is a quarter of a short run.
         from scipy.linalg.lapack import dgesv  # noqa: PLC0415
 
         _, _, answer, status = dgesv(kkt, right)
         if status != 0:
-            answer = np.asarray(np.linalg.lstsq(kkt, right)[0], dtype=np.float64)
+            least_squares, *_ = np.linalg.lstsq(kkt, right)
+            answer = np.asarray(least_squares, dtype=np.float64)
 
     v = np.zeros(seeds.shape)
-    v[:, free] = answer[:size].T
+    v[:, free] = answer[:n_free].T
     lam = np.zeros(limits.shape)
-    lam[:, active.at_limit] = answer[size:].T
+    lam[:, active.at_limit] = answer[n_free:].T
     return v, lam
 
 
@@ -311,21 +357,29 @@ def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-12) -> QpSolut
 def _newton_step(qp: SoftQp, solution: QpSolution) -> QpSolution:
     """The KKT point of the solution's active set, whether or not it is the right one."""
     active = solution.active(qp)
+
+    # The variables at a bound are known; those that are free are counted from zero.
+    at_upper_bound = solution.nu > 0
+    bound = np.where(at_upper_bound, qp.upper, qp.lower)
+    base = np.where(active.at_bound, bound, 0.0)
+
+    # λ = ±w + 2W(Γv − limit) of a violated row: the first part is known, the second is curvature.
     above = solution.lam > 0
     limit = np.where(above, qp.row_upper, qp.row_lower)
-    # The variables at a bound are known; those that are free are counted from zero.
-    base = np.where(active.at_bound, np.where(solution.nu > 0, qp.upper, qp.lower), 0.0)
-    # λ = ±w + 2W(Γv − limit) of a violated row: the first part is known, the second is curvature.
-    push = np.where(active.violated, np.where(above, qp.w, -qp.w), 0.0)
+    signed_w = np.where(above, qp.w, -qp.w)
+    push = np.where(active.violated, signed_w, 0.0)
     weight = np.where(active.violated, 2 * qp.W, 0.0)
 
+    # Newton's step from `base`: stationarity in the free variables, rows at their limits met.
     excess = qp.rows @ base - limit
-    seed = -(qp.H @ base + qp.f + (push + weight * excess) @ qp.rows)
-    step, lam_at_limit = kkt_solve(qp, active, seed[None], -excess[None])
-
-    v = base + step[0]
+    base_lam = push + weight * excess
+    gradient = qp.H @ base + qp.f + base_lam @ qp.rows
+    steps, lam_at_limit = kkt_solve(qp, active, -gradient[None], -excess[None])
+    v = base + steps[0]
     lam = lam_at_limit[0] + push + weight * (qp.rows @ v - limit)
-    nu = np.where(active.at_bound, -(qp.H @ v + qp.f + lam @ qp.rows), 0.0)
+    # What is left of the gradient is taken by the bounds.
+    gradient = qp.H @ v + qp.f + lam @ qp.rows
+    nu = np.where(active.at_bound, -gradient, 0.0)
     return QpSolution(v, nu, lam)
 
 
@@ -394,22 +448,32 @@ class DaqpBackend:
         if self._failed:  # an update is refused while the limits of a failed QP stand
             self._write_limits(qp)
         self._factorised = self._model.update(
-            H=qp.H, A=qp.rows, bupper=self._upper, blower=self._lower, sense=self._free
+            H=qp.H,
+            A=qp.rows,
+            bupper=self._upper,
+            blower=self._lower,
+            sense=self._unfixed,
         )
 
     def _set_up(self, qp: SoftQp) -> None:
         variables = qp.f.size
-        rows = qp.w.size
-        self._lower = np.zeros(variables + rows)
-        self._upper = np.zeros(variables + rows)
-        self._free = np.zeros(variables + rows, dtype=np.int32)
-        self._free[variables:] = DAQP_SOFT
-        self._sense = self._free.copy()
+        constraints = variables + qp.w.size
+        # DAQP's limits are those of the variables, then those of the rows, which are soft.
+        self._lower = np.zeros(constraints)
+        self._upper = np.zeros(constraints)
+        self._unfixed = np.zeros(constraints, dtype=np.int32)
+        self._unfixed[variables:] = DAQP_SOFT
+        self._sense = self._unfixed.copy()
+        self._write_limits(qp)
         self._model = daqp.Model()
         self._model.settings = DAQP_SETTINGS
-        self._write_limits(qp)
         self._factorised, _ = self._model.setup(
-            qp.H, qp.f, qp.rows, self._upper, self._lower, self._sense
+            qp.H,
+            qp.f,
+            qp.rows,
+            self._upper,
+            self._lower,
+            self._sense,
         )
         self._write_weights(qp)
 
@@ -421,7 +485,12 @@ class DaqpBackend:
         unused = np.ones(qp.f.size)
         linear = np.concatenate([unused, qp.w])
         compliance = np.concatenate([unused, 0.5 / qp.W])
-        self._model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
+        self._model.soft_weights(
+            rho_l=compliance,
+            rho_u=compliance,
+            w_l=linear,
+            w_u=linear,
+        )
 
     def _write_limits(self, qp: SoftQp) -> None:
         variables = qp.f.size
@@ -437,18 +506,25 @@ class DaqpBackend:
         self._failed = True
         if flag >= 0:
             self._write_limits(qp)
-            np.multiply(qp.lower == qp.upper, DAQP_FIXED, out=self._sense[:variables])
+            fixed = qp.lower == qp.upper
+            np.multiply(fixed, DAQP_FIXED, out=self._sense[:variables])
             flag = self._model.update(
-                f=qp.f, bupper=self._upper, blower=self._lower, sense=self._sense
+                f=qp.f,
+                bupper=self._upper,
+                blower=self._lower,
+                sense=self._sense,
             )
         if flag >= 0:
             v, _, flag, info = self._model.solve()
         if flag <= 0:
             status = DAQP_STATUS.get(flag, f"exit flag {flag}")
-            raise QpError(f"DAQP did not solve the QP: {status}", status=status, qp=qp.copy())
+            message = f"DAQP did not solve the QP: {status}"
+            raise QpError(message, status=status, qp=qp.copy())
         self._failed = False
         multipliers = info["lam"]
-        return QpSolution(v, multipliers[:variables], multipliers[variables:])
+        nu = multipliers[:variables]
+        lam = multipliers[variables:]
+        return QpSolution(v, nu, lam)
 
 
 POLISHED_RESIDUAL = 1e-9
@@ -456,13 +532,15 @@ POLISHED_RESIDUAL = 1e-9
 
 # Options of each attempt. ProxQP 0.8.0 takes some feasible QPs for infeasible, others with and
 # without the switch.
+PROXQP_TOLERANCES = {"eps_abs": 1e-9, "eps_rel": 0.0}
+CLARABEL_TOLERANCES = {"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
 SOLVER_ATTEMPTS: dict[str, list[dict[str, Any]]] = {
     "proxqp": [
-        {"eps_abs": 1e-9, "eps_rel": 0.0},
-        {"eps_abs": 1e-9, "eps_rel": 0.0, "primal_infeasibility_solving": True},
+        PROXQP_TOLERANCES,
+        PROXQP_TOLERANCES | {"primal_infeasibility_solving": True},
     ],
-    "clarabel": [{"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}],
-    "daqp": [{"primal_tol": 1e-10, "dual_tol": 1e-12}],
+    "clarabel": [CLARABEL_TOLERANCES],
+    "daqp": [DAQP_SETTINGS],
 }
 
 
@@ -494,9 +572,11 @@ class QpsolversBackend:
         """Solve with the matrices and vectors of `qp`; raises QpError where the solver does not."""
         import qpsolvers  # noqa: PLC0415
 
-        problem = qpsolvers_problem(qp, dense=self._solver in qpsolvers.dense_solvers)
+        dense = self._solver in qpsolvers.dense_solvers
+        problem = qpsolvers_problem(qp, dense=dense)
+        attempts: list[dict[str, Any]] = SOLVER_ATTEMPTS.get(self._solver, [{}])
         reason = "not solved"
-        for options in SOLVER_ATTEMPTS.get(self._solver, [{}]):
+        for options in attempts:
             try:
                 answer = qpsolvers.solve_problem(problem, solver=self._solver, **options)
             except qpsolvers.QPError as error:
@@ -508,9 +588,8 @@ class QpsolversBackend:
             # A solver may say that it failed where it is near: what it says is not looked at.
             if solution.residual(qp) < POLISHED_RESIDUAL:
                 return solution
-        raise QpError(
-            f"{self._solver} did not solve the QP: {reason}", status="not solved", qp=qp.copy()
-        )
+        message = f"{self._solver} did not solve the QP: {reason}"
+        raise QpError(message, status="not solved", qp=qp.copy())
 
 
 def _read_answer(qp: SoftQp, answer: qpsolvers.Solution) -> QpSolution:
@@ -519,11 +598,13 @@ def _read_answer(qp: SoftQp, answer: qpsolvers.Solution) -> QpSolution:
     rows = qp.w.size
     v = np.asarray(answer.x)[:variables]
     # A fixed variable is an equation there, and its multiplier that of the equation.
-    box = np.asarray(answer.z_box).copy()
-    box[np.flatnonzero(qp.lower == qp.upper)] = np.asarray(answer.y)
+    nu = np.asarray(answer.z_box)[:variables].copy()
+    fixed = qp.lower == qp.upper
+    nu[fixed] = np.asarray(answer.y)
     # Two inequalities a row: first those of the lower limits, then those of the upper ones.
     z = np.asarray(answer.z)
-    return QpSolution(v, box[:variables], z[rows:] - z[:rows])
+    lam = z[rows:] - z[:rows]
+    return QpSolution(v, nu, lam)
 
 
 def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
@@ -547,20 +628,29 @@ def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
 
     variables = qp.f.size
     rows = qp.w.size
-    fixed = qp.lower == qp.upper
-    slack = qp.H.diagonal().max() / qp.w
-    unit = np.diag(slack)
+    size = variables + rows
+    slack_unit = qp.H.diagonal().max() / qp.w
 
-    P = np.zeros((variables + rows, variables + rows))
+    # Cost of (v, τ).
+    P = np.zeros((size, size))
     P[:variables, :variables] = qp.H
-    P[variables:, variables:] = np.diag(2 * qp.W * slack**2)
-    q = np.concatenate([qp.f, qp.w * slack])
-    G = np.block([[-qp.rows, -unit], [qp.rows, -unit]])
+    P[variables:, variables:] = np.diag(2 * qp.W * slack_unit**2)
+    q = np.concatenate([qp.f, qp.w * slack_unit])
+
+    # Two inequalities a row: first those of the lower limits, then those of the upper ones.
+    slack = np.diag(slack_unit)
+    G = np.block([[-qp.rows, -slack], [qp.rows, -slack]])
     h = np.concatenate([-qp.row_lower, qp.row_upper])
-    A = np.eye(variables, variables + rows)[fixed]
+
+    # A fixed variable has an equation in the place of its bounds.
+    fixed = qp.lower == qp.upper
+    A = np.eye(variables, size)[fixed]
     b = qp.lower[fixed]
-    lower = np.concatenate([np.where(fixed, -np.inf, qp.lower), np.zeros(rows)])
-    upper = np.concatenate([np.where(fixed, np.inf, qp.upper), np.full(rows, np.inf)])
+    least_v = np.where(fixed, -np.inf, qp.lower)
+    most_v = np.where(fixed, np.inf, qp.upper)
+    lower = np.concatenate([least_v, np.zeros(rows)])
+    upper = np.concatenate([most_v, np.full(rows, np.inf)])
+
     if not dense:
         P = sp.csc_matrix(P)
         G = sp.csc_matrix(G)

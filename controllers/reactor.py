@@ -4,7 +4,19 @@ from __future__ import annotations
 
 import casadi as ca
 
-from controllers.model import Model, Quantity
+from controllers.model import Model, Quantity, by_name
+
+PARAMETERS = (
+    Quantity("V", "L", 100.0),
+    Quantity("k0", "1/min", 9.2e4),
+    Quantity("E", "K", 4000.0),
+    Quantity("heat", "K.L/mol", 120.0),
+    Quantity("UA", "1/min", 2.09),
+    Quantity("feed_price", "1", 0.1),
+    Quantity("pump_price", "1", 0.004),
+    Quantity("cooling_price", "1", 0.01),
+    Quantity("fixed_cost", "1", 50.0),
+)
 
 
 def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
@@ -12,47 +24,51 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     cA, T = ca.vertsplit(x)
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
-    V, k0, E, heat, UA, *_ = ca.vertsplit(p)
-    rate = k0 * ca.exp(-E / T) * cA
+    k = by_name(PARAMETERS, p)
+
+    # Arrhenius' law, first order in A.
+    rate = k["k0"] * ca.exp(-k["E"] / T) * cA
+    fed = q / k["V"] * (cAf - cA)
+    heated_by_feed = q / k["V"] * (Tf - T)
+    heated_by_reaction = k["heat"] * rate
+    heated_by_jacket = k["UA"] * (Tc - T)
     return ca.vertcat(
-        q / V * (cAf - cA) - rate,
-        q / V * (Tf - T) + heat * rate + UA * (Tc - T),
+        fed - rate,
+        heated_by_feed + heated_by_reaction + heated_by_jacket,
     )
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     """Feed, pumping and cooling less the product, per minute."""
-    cA, _ = ca.vertsplit(x)
+    cA = x[0]
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
-    feed, pump, cooling, fixed = ca.vertsplit(p[5:])
+    k = by_name(PARAMETERS, p)
+    feed = k["feed_price"] * q * cAf
     product = q * (cAf - cA)
-    quadratic = pump * q**2 + cooling * (Tf - Tc) ** 2
-    return fixed + feed * q * cAf - product + quadratic
+    pumping = k["pump_price"] * q**2
+    cooling = k["cooling_price"] * (Tf - Tc) ** 2
+    return k["fixed_cost"] + feed - product + (pumping + cooling)
 
 
 def model() -> Model:
     """An exothermic reaction A → B in a stirred tank with a cooling jacket; time in minutes."""
     return Model(
         name="reactor",
-        states=(Quantity("cA", "mol/L", 0.5), Quantity("T", "K", 345.0)),
-        actions=(Quantity("q", "L/min", 100.0), Quantity("Tc", "K", 320.0)),
+        states=(
+            Quantity("cA", "mol/L", 0.5),
+            Quantity("T", "K", 345.0),
+        ),
+        actions=(
+            Quantity("q", "L/min", 100.0),
+            Quantity("Tc", "K", 320.0),
+        ),
         disturbances=(
             Quantity("cAf", "mol/L", 1.0),
             # Counted from 0 °C, as the evaporator's temperatures are.
             Quantity("Tf", "K", 350.0, magnitude=76.85),
         ),
-        parameters=(
-            Quantity("V", "L", 100.0),
-            Quantity("k0", "1/min", 9.2e4),
-            Quantity("E", "K", 4000.0),
-            Quantity("heat", "K.L/mol", 120.0),
-            Quantity("UA", "1/min", 2.09),
-            Quantity("feed_price", "1", 0.1),
-            Quantity("pump_price", "1", 0.004),
-            Quantity("cooling_price", "1", 0.01),
-            Quantity("fixed_cost", "1", 50.0),
-        ),
+        parameters=PARAMETERS,
         ode=_ode,
         economic_cost=_economic_cost,
         time_unit=60.0,

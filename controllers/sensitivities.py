@@ -14,7 +14,12 @@ import casadi as ca
 import numpy as np
 
 from controllers.functions import StackedFunction
-from controllers.preparation import stage_function, stage_parameter_gradient
+from controllers.preparation import (
+    matrix_symbols,
+    scalar_symbols,
+    stage_function,
+    stage_parameter_gradient,
+)
 from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
@@ -43,7 +48,10 @@ def _theta_lagrangian(
             side, (n+m, N(n+m)); None where the Hessian is the cost's own.
     """
     horizon = problem.horizon
+    # What does not hold θ has no part in the derivative, and is left out.
     gamma = problem.discount
+    B_l = symbols["B_l"]
+    b_l = symbols["b_l"]
     xi = ca.horzsplit(y["xi"])
     chi = ca.horzsplit(y["chi"])
     v = ca.horzsplit(y["v"])
@@ -51,27 +59,38 @@ def _theta_lagrangian(
     lam = ca.horzsplit(y["lam"])
     M_k = None if M is None else ca.horzsplit(M, points.size1())
 
-    terms = ca.bilin(symbols["B_lambda"], xi[0]) + ca.dot(symbols["b_lambda"], xi[0])
+    # λ_θ(ξ_0), then the stages, then V^f_θ(ξ_N).
+    terms = _quadratic_form(symbols["B_lambda"], symbols["b_lambda"], xi[0])
     terms += symbols["c_lambda"]
     for k in range(horizon):
         w = ca.vertcat(xi[k], v[k])
-        stage = ca.dot(symbols["b_l"], w)
+        stage = ca.dot(b_l, w)
         if M_k is None:
-            stage += ca.bilin(symbols["B_l"], w)
+            stage += ca.bilin(B_l, w)
         else:
             # The cost expanded about the point, where B_l enters the lifted block by M too.
             point = points[:, k] - problem.reference
-            stage += ca.bilin(symbols["B_l"], point, 2 * w - point)
-            stage += 2 * ca.dot(M_k[k], symbols["B_l"])
+            stage += ca.bilin(B_l, point, 2 * w - point)
+            stage += 2 * ca.dot(M_k[k], B_l)
         terms += gamma**k * stage + ca.dot(chi[k + 1], symbols["c_f"])
-        terms += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], t[k])
-        terms += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], t[k] ** 2)
+
+        # The slack's price, which counts from stage 1 on.
+        next_discount = gamma ** (k + 1)
+        terms += next_discount * ca.dot(symbols["w_sigma"], t[k])
+        terms += next_discount * ca.dot(symbols["W_sigma"], t[k] ** 2)
+
         # λ is negative where a lower limit pushes, positive where an upper one does.
-        terms += ca.dot(ca.fmax(-lam[k], 0), symbols["x_l"])
-        terms -= ca.dot(ca.fmax(lam[k], 0), symbols["x_u"])
-    end = xi[horizon]
-    terminal = ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
+        from_below = ca.fmax(-lam[k], 0)
+        from_above = ca.fmax(lam[k], 0)
+        terms += ca.dot(from_below, symbols["x_l"])
+        terms -= ca.dot(from_above, symbols["x_u"])
+    terminal = _quadratic_form(symbols["B_Vf"], symbols["b_Vf"], xi[horizon])
     return terms + gamma**horizon * terminal
+
+
+def _quadratic_form(B: ca.SX, b: ca.SX, x: ca.SX) -> ca.SX:
+    """xᵀBx + bᵀx, as θ has its costs: without a half."""
+    return ca.bilin(B, x) + ca.dot(b, x)
 
 
 class _Sensitivities:
@@ -81,62 +100,82 @@ class _Sensitivities:
     `y` are the symbols of a solution in the model's units, in which the Lagrangian is written.
     """
 
-    def __init__(self, problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        blocks: ThetaBlocks,
+        *,
+        exact: bool,
+    ) -> None:
         n = problem.n_states
         m = problem.n_actions
         horizon = problem.horizon
         self.problem = problem
         self.blocks = blocks
         self.exact = exact
-        self.symbols = symbolic_theta(problem, blocks)
-        self.y = {
-            "xi": ca.SX.sym("xi", n, horizon + 1),
-            "v": ca.SX.sym("v", m, horizon),
-            "t": ca.SX.sym("t", n, horizon),
-            "lam": ca.SX.sym("lam", n, horizon),
-            "chi": ca.SX.sym("chi", n, horizon + 1),
-        }
-        self.scaled = {
-            "v": ca.SX.sym("v", m, horizon),
-            "lam": ca.SX.sym("lam", n, horizon),
-        }
-        self.x = ca.SX.sym("x", n, horizon)
-        self.u = ca.SX.sym("u", m, horizon)
-        self.M = ca.SX.sym("M", n + m, horizon * (n + m))
-        self.guess = ca.SX.sym("guess", n, horizon)
+        self.y = scalar_symbols(
+            {
+                "xi": (n, horizon + 1),
+                "v": (m, horizon),
+                "t": (n, horizon),
+                "lam": (n, horizon),
+                "chi": (n, horizon + 1),
+            }
+        )
+        self.scaled = scalar_symbols({"v": (m, horizon), "lam": (n, horizon)})
+        points = scalar_symbols({"x": (n, horizon), "u": (m, horizon)})
+        curvature: dict[str, ca.SX] = {}
+        if exact:
+            curvature = scalar_symbols(
+                {
+                    "M": (n + m, horizon * (n + m)),
+                    "guess": (n, horizon),
+                }
+            )
 
-        points = ca.vertcat(self.x, self.u)
-        M = self.M if exact else None
-        lagrangian = _theta_lagrangian(problem, self.symbols, self.y, points, M)
-        self.gradient = ca.gradient(lagrangian, self.symbols["theta"])
+        symbols = symbolic_theta(problem, blocks)
+        theta = symbols["theta"]
+        self.M = curvature.get("M")
+        lagrangian = _theta_lagrangian(
+            problem,
+            symbols,
+            self.y,
+            ca.vertcat(*points.values()),
+            self.M,
+        )
+        self.gradient = ca.gradient(lagrangian, theta)
         """All of it but the part of p, which is a sum of a function of one stage."""
 
         solution = {name: self.y[name] for name in SOLUTION_PARTS} | self.scaled
-        self.inputs = {**solution, "x": self.x, "u": self.u, "theta": self.symbols["theta"]}
-        if exact:
-            self.inputs |= {"M": self.M, "guess": self.guess}
+        self.inputs = {**solution, **points, "theta": theta, **curvature}
 
     def in_scaled_units(self, expression: ca.SX) -> ca.SX:
         """The expression of v and lam in the model's units as one of the scaled ones."""
         scale = self.problem.scale
         horizon = self.problem.horizon
-        v = self.scaled["v"] * ca.repmat(ca.DM(scale.action), 1, horizon)
-        lam = self.scaled["lam"] * ca.repmat(ca.DM(scale.state_price), 1, horizon)
-        return ca.substitute([expression], [self.y["v"], self.y["lam"]], [v, lam])[0]
+        action_scale = ca.repmat(ca.DM(scale.action), 1, horizon)
+        price = ca.repmat(ca.DM(scale.state_price), 1, horizon)
+        v = self.scaled["v"] * action_scale
+        lam = self.scaled["lam"] * price
+        # The QP's own numbers come as they are, so the conversion is part of the function.
+        unscaled = [self.y["v"], self.y["lam"]]
+        (substituted,) = ca.substitute([expression], unscaled, [v, lam])
+        return substituted
 
     def value_gradient(self) -> StackedFunction:
         """dV/dθ or dQ/dθ: the Lagrangian's gradient at a solution."""
         results = {"gradient": self.in_scaled_units(self.gradient)}
         if "p" not in self.blocks:
             return StackedFunction("value_gradient", self.inputs, results)
+
         # A stage's gradient is called: written out for each stage its C takes minutes to compile.
         rest = stage_function("value_gradient_rest", self.inputs, results)
         stage = stage_parameter_gradient(self.problem, self.blocks, exact=self.exact)
+        stages = stage.map(self.problem.horizon)
         symbols = _call_symbols(self.inputs)
-        arguments = self._stage_arguments(symbols)
-        stages = stage.map(self.problem.horizon)(*arguments)
+        by_stage = stages(*self._stage_arguments(symbols))
         gradient = rest(*symbols.values())
-        gradient[self.blocks.slices["p"]] = ca.sum2(stages)
+        gradient[self.blocks.slices["p"]] = ca.sum2(by_stage)
         return StackedFunction("value_gradient", symbols, {"gradient": gradient})
 
     def policy_jacobian(self) -> StackedFunction:
@@ -146,21 +185,24 @@ class _Sensitivities:
         m = problem.n_actions
         horizon = problem.horizon
         width = n + m
-        qp = {
-            "A": ca.SX.sym("A", n, n * horizon),
-            "B": ca.SX.sym("B", m, n * horizon),
-            "L": ca.SX.sym("L", width, horizon * width),
-            "L_N": ca.SX.sym("L_N", n, n),
+        qp = scalar_symbols(
+            {
+                "A": (n, n * horizon),
+                "B": (m, n * horizon),
+                "L": (width, horizon * width),
+                "L_N": (n, n),
+            }
+        )
+        direction_shapes = {
+            "dv": (m * horizon, m),
+            "dt": (n * horizon, m),
+            "dlam": (n * horizon, m),
         }
-        directions = {
-            "dv": ca.SX.sym("dv", m * horizon, m),
-            "dt": ca.SX.sym("dt", n * horizon, m),
-            "dlam": ca.SX.sym("dlam", n * horizon, m),
-        }
-        differentiated = list(self.y.values())
-        if self.exact:
-            directions["dM"] = ca.SX.sym("dM", width * horizon * width, m)
-            differentiated.append(self.M)
+        moving = list(self.y.values())
+        if self.M is not None:
+            direction_shapes["dM"] = (width * horizon * width, m)
+            moving.append(self.M)
+        directions = scalar_symbols(direction_shapes)
 
         policy = []
         by_state = []
@@ -171,39 +213,52 @@ class _Sensitivities:
             unit = float(problem.scale.action[i] / problem.scale.cost)
             direction = self._direction(qp, column, unit)
             moved_solution = ca.veccat(*direction.values())
-            derivative = ca.jtimes(self.gradient, ca.veccat(*differentiated), moved_solution)
+            derivative = ca.jtimes(self.gradient, ca.veccat(*moving), moved_solution)
+            # dy/dθ is minus the inverse KKT matrix times ∇θ∇_y: hence the sign.
             policy.append(-self.in_scaled_units(derivative))
-            by_state.append(-direction["chi"][:, 0])
+            d_chi = direction["chi"]
+            by_state.append(-d_chi[:, 0])
+            # What of the direction the stages' gradients in p need.
             moved[f"w_{i}"] = ca.vertcat(direction["xi"][:, :horizon], direction["v"])
-            moved[f"chi_{i}"] = direction["chi"][:, 1:]
+            moved[f"chi_{i}"] = d_chi[:, 1:]
         inputs = {**self.inputs, **qp, **directions}
         results = {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)}
         if "p" not in self.blocks:
             return StackedFunction("policy_jacobian", inputs, results)
 
         rest = stage_function("policy_jacobian_rest", inputs, {**results, **moved})
-        stage = self._moved_parameter_gradient().map(horizon)
+        stages = self._moved_parameter_gradient().map(horizon)
         symbols = _call_symbols(inputs)
         arguments = self._stage_arguments(symbols)
-        parts = dict(zip(rest.name_out(), rest(*symbols.values()), strict=True))
+        values = rest(*symbols.values())
+        parts = dict(zip(rest.name_out(), values, strict=True))
+        jacobian = parts["policy"]
         for i in range(m):
             along = [parts[f"w_{i}"], parts[f"chi_{i}"]]
             if self.exact:
-                along.append(ca.reshape(symbols["dM"][:, i], width, horizon * width))
-            of_stages = stage(*arguments, *along)
-            parts["policy"][self.blocks.slices["p"], i] = -ca.sum2(of_stages)
-        whole = {name: parts[name] for name in ("policy", "state")}
-        return StackedFunction("policy_jacobian", symbols, whole)
+                dM = symbols["dM"][:, i]
+                along.append(ca.reshape(dM, width, horizon * width))
+            by_stage = stages(*arguments, *along)
+            jacobian[self.blocks.slices["p"], i] = -ca.sum2(by_stage)
+        results_with_p = {"policy": jacobian, "state": parts["state"]}
+        return StackedFunction("policy_jacobian", symbols, results_with_p)
 
     def _stage_arguments(self, symbols: Mapping[str, ca.MX]) -> list[ca.MX]:
         """Arguments of `stage_parameter_gradient`, those of stage 0, 1, … side by side."""
         problem = self.problem
         horizon = problem.horizon
-        v = symbols["v"] * ca.repmat(ca.DM(problem.scale.action), 1, horizon)
+        action_scale = ca.repmat(ca.DM(problem.scale.action), 1, horizon)
+        reference = ca.repmat(ca.DM(problem.reference), 1, horizon)
+        v = symbols["v"] * action_scale
         w = ca.vertcat(symbols["xi"][:, :horizon], v)
-        w += ca.repmat(ca.DM(problem.reference), 1, horizon)
-        theta = ca.repmat(symbols["theta"], 1, horizon)
-        arguments = [symbols["x"], symbols["u"], theta, w, symbols["chi"][:, 1:]]
+        w += reference
+        arguments = [
+            symbols["x"],
+            symbols["u"],
+            ca.repmat(symbols["theta"], 1, horizon),
+            w,
+            symbols["chi"][:, 1:],
+        ]
         if self.exact:
             arguments += [symbols["M"], symbols["guess"]]
         return arguments
@@ -211,18 +266,27 @@ class _Sensitivities:
     def _moved_parameter_gradient(self) -> ca.Function:
         """Directional derivative of `stage_parameter_gradient` in w, χ and, if exact, M."""
         stage = stage_parameter_gradient(self.problem, self.blocks, exact=self.exact)
-        arguments = {
-            name: ca.SX.sym(name, *stage.size_in(i)) for i, name in enumerate(stage.name_in())
-        }
-        names = ("w", "chi", "M") if self.exact else ("w", "chi")
-        along = {f"d{name}": ca.SX.sym(f"d{name}", *arguments[name].shape) for name in names}
-        variables = ca.veccat(*(arguments[name] for name in names))
-        derivative = ca.jtimes(stage(*arguments.values()), variables, ca.veccat(*along.values()))
-        inputs = {**arguments, **along}
-        return stage_function("moved_parameter_gradient", inputs, {"derivative": derivative})
+        shapes = {name: stage.size_in(i) for i, name in enumerate(stage.name_in())}
+        arguments = scalar_symbols(shapes)
+        moving = ["w", "chi"]
+        if self.exact:
+            moving.append("M")
+        along = scalar_symbols({f"d{name}": shapes[name] for name in moving})
+
+        gradient = stage(*arguments.values())
+        variables = [arguments[name] for name in moving]
+        derivative = ca.jtimes(gradient, ca.veccat(*variables), ca.veccat(*along.values()))
+        return stage_function(
+            "moved_parameter_gradient",
+            {**arguments, **along},
+            {"derivative": derivative},
+        )
 
     def _direction(
-        self, qp: Mapping[str, ca.SX], column: Mapping[str, ca.SX], unit: float
+        self,
+        qp: Mapping[str, ca.SX],
+        column: Mapping[str, ca.SX],
+        unit: float,
     ) -> dict[str, ca.SX]:
         """An adjoint direction of the whole solution in the model's units, by its parts.
 
@@ -240,23 +304,32 @@ class _Sensitivities:
         t = ca.reshape(column["dt"], n, horizon)
         lam = ca.reshape(column["dlam"], n, horizon)
 
+        # Forward by the dynamics from a state that is given, so does not move.
         xi = [ca.SX(n, 1)]
         for k in range(horizon):
-            xi.append(A[k].T @ xi[k] + B[k].T @ v[:, k])
+            next_xi = A[k].T @ xi[k] + B[k].T @ v[:, k]
+            xi.append(next_xi)
+
+        # Backward by the adjoint recursion; the state of stage k ≥ 1 has the row k−1.
         chi = [qp["L_N"] @ xi[horizon] + lam[:, horizon - 1]]
         for k in reversed(range(horizon)):
-            costate = L[k][:n, :] @ ca.vertcat(xi[k], v[:, k]) + A[k] @ chi[0]
-            chi.insert(0, costate + (lam[:, k - 1] if k else 0))
+            w = ca.vertcat(xi[k], v[:, k])
+            costate = L[k][:n, :] @ w + A[k] @ chi[0]
+            if k:
+                costate += lam[:, k - 1]
+            chi.insert(0, costate)
 
         state = ca.DM(problem.scale.state)
         action = ca.DM(problem.scale.action)
         price = ca.DM(problem.scale.state_price)
+        d_xi = [part * state * unit for part in xi]
+        d_chi = [part * price * unit for part in chi]
         direction = {
-            "xi": ca.horzcat(*(part * state * unit for part in xi)),
+            "xi": ca.horzcat(*d_xi),
             "v": v * ca.repmat(action * unit, 1, horizon),
             "t": t * ca.repmat(state * unit, 1, horizon),
             "lam": lam * ca.repmat(price * unit, 1, horizon),
-            "chi": ca.horzcat(*(part * price * unit for part in chi)),
+            "chi": ca.horzcat(*d_chi),
         }
         if self.exact:
             direction["M"] = column["dM"]
@@ -265,11 +338,14 @@ class _Sensitivities:
 
 def _call_symbols(inputs: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
     """Symbols of the same names and shapes for a graph of calls."""
-    return {name: ca.MX.sym(name, *symbol.shape) for name, symbol in inputs.items()}
+    return matrix_symbols({name: symbol.shape for name, symbol in inputs.items()})
 
 
 def sensitivities(
-    problem: Problem, blocks: ThetaBlocks, *, exact: bool
+    problem: Problem,
+    blocks: ThetaBlocks,
+    *,
+    exact: bool,
 ) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
     """Gradient of the value in θ, and a maker of its derivatives along the KKT adjoints.
 
@@ -295,7 +371,9 @@ def sensitivities(
 
 
 def adjoint_directions(
-    qp: SoftQp, solution: QpSolution, n_actions: int
+    qp: SoftQp,
+    solution: QpSolution,
+    n_actions: int,
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Solutions dv, dt, dλ of the KKT system for unit right-hand sides in u_0, a row an action.
 
@@ -311,15 +389,18 @@ def adjoint_directions(
         dv (m, mN), dt (m, nN) and dλ (m, nN).
     """
     active = solution.active(qp)
+    # u_0 is the first of the variables.
     seeds = np.eye(n_actions, qp.f.size)
-    dv, dlam = kkt_solve(qp, active, seeds, np.zeros((n_actions, qp.w.size)))
+    unmoved_limits = np.zeros((n_actions, qp.w.size))
+    dv, dlam = kkt_solve(qp, active, seeds, unmoved_limits)
     dt = np.zeros_like(dlam)
     violated = active.violated
     if violated.any():
         # The slack of a violated row moves with the row, and λ = ±(w + 2Wt) with the slack.
         row_change = (dv @ qp.rows.T)[:, violated]
+        side = np.sign(solution.lam[violated])
         dlam[:, violated] = 2 * qp.W[violated] * row_change
-        dt[:, violated] = np.sign(solution.lam[violated]) * row_change
+        dt[:, violated] = side * row_change
     return dv, dt, dlam
 
 
@@ -343,14 +424,20 @@ def curvature_directions(
     """
     horizon, width = step.shape
     n = rows.shape[0] // horizon
+    m = width - n
+    # One unit of the scaled action's price, in the model's units.
+    units = scale.action / scale.cost
     result = []
-    for unit, row in zip(scale.action / scale.cost, dv, strict=True):
+    for unit, row in zip(units, dv, strict=True):
+        # dw of each stage. The rows are x_1 … x_N; x_0 is given and does not move, x_N is in no
+        # stage.
+        moved_states = (rows @ row).reshape(horizon, n)
         direction = np.zeros((horizon, width))
-        # The rows are x_1 … x_N; x_0 is given and does not move, x_N is in no stage.
-        direction[1:, :n] = (rows @ row).reshape(horizon, n)[:-1]
-        direction[:, n:] = row.reshape(horizon, width - n)
+        direction[1:, :n] = moved_states[:-1]
+        direction[:, n:] = row.reshape(horizon, m)
         direction *= scale.both * unit
         outer = step[:, :, None] * direction[:, None, :]
         transposed = direction[:, :, None] * step[:, None, :]
-        result.append(contract((outer + transposed) / 2).reshape(-1))
+        symmetric = (outer + transposed) / 2
+        result.append(contract(symmetric).reshape(-1))
     return np.array(result)

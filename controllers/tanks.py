@@ -13,9 +13,13 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     """Rates of the four levels per second; `d` is the water drawn from the lower tanks."""
     areas = p[:4]
     holes = p[4:8]
-    k1, k2, split1, split2 = ca.vertsplit(p[8:])
+    k1, k2 = ca.vertsplit(p[8:10])
+    split1, split2 = ca.vertsplit(p[10:])
+
     # Torricelli's law; the least level keeps the root differentiable in an empty tank.
-    out = holes * ca.sqrt(2 * GRAVITY * ca.fmax(x, 1e-3))
+    level = ca.fmax(x, 1e-3)
+    out = holes * ca.sqrt(2 * GRAVITY * level)
+    # Each pump feeds a lower tank and, crosswise, the upper one over the other lower tank.
     pump1 = k1 * u[0]
     pump2 = k2 * u[1]
     inflow = ca.vertcat(
@@ -42,8 +46,14 @@ def model() -> Model:
             Quantity("h3", "cm", 10.0),
             Quantity("h4", "cm", 10.0),
         ),
-        actions=(Quantity("v1", "V", 3.0), Quantity("v2", "V", 3.0)),
-        disturbances=(Quantity("d1", "cm3/s", 3.0), Quantity("d2", "cm3/s", 3.0)),
+        actions=(
+            Quantity("v1", "V", 3.0),
+            Quantity("v2", "V", 3.0),
+        ),
+        disturbances=(
+            Quantity("d1", "cm3/s", 3.0),
+            Quantity("d2", "cm3/s", 3.0),
+        ),
         parameters=(
             Quantity("A1", "cm2", 28.0),
             Quantity("A2", "cm2", 32.0),

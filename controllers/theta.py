@@ -99,7 +99,8 @@ class ThetaBlock:
     def unpack(self, packed: Vector) -> Vector:
         """Value of the block in its own shape from its packed entries."""
         if self.symmetric:
-            return symmetric_matrix(packed, self.shape[0])
+            dimension = self.shape[0]
+            return symmetric_matrix(packed, dimension)
         return packed.reshape(self.shape).copy()
 
 
@@ -112,7 +113,8 @@ class ThetaBlocks:
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Slice of each block in θ."""
-        return consecutive({block.name: block.size for block in self.blocks})
+        sizes = {block.name: block.size for block in self.blocks}
+        return consecutive(sizes)
 
     @cached_property
     def size(self) -> int:
@@ -122,21 +124,24 @@ class ThetaBlocks:
     @cached_property
     def scale(self) -> Vector:
         """Learning scale of each entry of θ."""
-        return np.concatenate([np.array(block.scale) for block in self.blocks])
+        scales = [np.array(block.scale) for block in self.blocks]
+        return np.concatenate(scales)
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """A name for each entry of θ, such as `B_l[0,2]`."""
         names: list[str] = []
         for block in self.blocks:
+            if not block.shape:
+                names.append(block.name)
+                continue
             entries: Iterable[object] = block.labels or range(block.size)
             if block.symmetric:
-                pairs = zip(*upper_triangle(block.shape[0]), strict=True)
-                entries = (f"{i},{j}" for i, j in pairs)
-            if block.shape:
-                names += [f"{block.name}[{entry}]" for entry in entries]
-            else:
-                names.append(block.name)
+                # In the order of the packed entries.
+                rows, columns = upper_triangle(block.shape[0])
+                entries = [f"{i},{j}" for i, j in zip(rows, columns, strict=True)]
+            for entry in entries:
+                names.append(f"{block.name}[{entry}]")
         return tuple(names)
 
     def __iter__(self) -> Iterator[ThetaBlock]:
@@ -178,36 +183,36 @@ class ThetaBlocks:
         kappa = units.cost
         states = units.state
         both = np.concatenate([states, units.action])
+        # Curvatures that make a cost of κ over a unit of each variable, slopes a tenth of it.
         state_hessian = kappa / np.outer(states, states)
+        state_gradient = 0.1 * kappa / states
         hessian = kappa / np.outer(both, both)
-
-        def block(name: str, scale: Vector, meaning: str, least: ArrayLike = ()) -> ThetaBlock:
-            packed = scale[upper_triangle(len(scale))] if scale.ndim == 2 else scale.reshape(-1)
-            smallest = tuple(np.asarray(least).tolist())
-            return ThetaBlock(name, scale.shape, tuple(packed.tolist()), meaning, least=smallest)
-
+        gradient = 0.1 * kappa / both
+        constant = np.array(0.1 * kappa)
+        bound = 0.01 * states
         blocks = [
-            block("B_lambda", state_hessian, "initial cost, quadratic"),
-            block("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
-            block("c_lambda", np.array(0.1 * kappa), "initial cost, constant"),
-            block("B_Vf", state_hessian, "terminal cost, quadratic"),
-            block("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
-            block("B_l", hessian, "stage cost, quadratic"),
-            block("b_l", 0.1 * kappa / both, "stage cost, linear"),
-            block("c_f", 0.001 * states, "model offset"),
-            block("x_l", 0.01 * states, "lower state bound"),
-            block("x_u", 0.01 * states, "upper state bound"),
+            _block("B_lambda", state_hessian, "initial cost, quadratic"),
+            _block("b_lambda", state_gradient, "initial cost, linear"),
+            _block("c_lambda", constant, "initial cost, constant"),
+            _block("B_Vf", state_hessian, "terminal cost, quadratic"),
+            _block("b_Vf", state_gradient, "terminal cost, linear"),
+            _block("B_l", hessian, "stage cost, quadratic"),
+            _block("b_l", gradient, "stage cost, linear"),
+            _block("c_f", 0.001 * states, "model offset"),
+            _block("x_l", bound, "lower state bound"),
+            _block("x_u", bound, "upper state bound"),
         ]
         if slack_weights:
+            # Below its least weights a penalty is not exact: the QP would rather violate a bound.
             quadratic = kappa / states**2
             blocks += [
-                block(
+                _block(
                     "w_sigma",
                     kappa / states,
                     "slack of stages 1…N, linear weight",
                     units.exact_penalty_weights(),
                 ),
-                block(
+                _block(
                     "W_sigma",
                     1e3 * quadratic,
                     "slack of stages 1…N, quadratic weight",
@@ -215,11 +220,38 @@ class ThetaBlocks:
                 ),
             ]
         if model_parameters:
-            indices = problem.model.parameter_indices(model_parameters)
-            scale = tuple(0.1 * abs(problem.model.parameters[i].nominal) for i in indices)
-            shape = (len(indices),)
-            blocks.append(ThetaBlock("p", shape, scale, "model parameters", model_parameters))
+            model = problem.model
+            indices = model.parameter_indices(model_parameters)
+            nominal = [model.parameters[i].nominal for i in indices]
+            parameters = ThetaBlock(
+                name="p",
+                shape=(len(indices),),
+                scale=tuple(0.1 * abs(value) for value in nominal),
+                meaning="model parameters",
+                labels=model_parameters,
+            )
+            blocks.append(parameters)
         return cls(tuple(blocks))
+
+
+def _block(
+    name: str,
+    scale: Vector,
+    meaning: str,
+    least: ArrayLike = (),
+) -> ThetaBlock:
+    """A block of the shape of its scale, which is a scalar, a vector or a symmetric matrix."""
+    # Packed as θ has it.
+    packed = scale.reshape(-1)
+    if scale.ndim == 2:
+        packed = scale[upper_triangle(len(scale))]
+    return ThetaBlock(
+        name,
+        scale.shape,
+        tuple(packed.tolist()),
+        meaning,
+        least=tuple(np.asarray(least).tolist()),
+    )
 
 
 class _File(Table):
@@ -249,16 +281,19 @@ class Parameters(Shown):
         theta = np.array(self.theta, dtype=np.float64)
         if theta.shape != (self.blocks.size,):
             raise ParameterError(f"θ has shape {theta.shape}; it must have ({self.blocks.size},)")
-        if not np.isfinite(theta).all():
+        finite = np.isfinite(theta)
+        if not finite.all():
             # The first entry is named: a message with all of θ helps nobody.
-            bad = self.blocks.labels[int(np.flatnonzero(~np.isfinite(theta))[0])]
-            raise ParameterError(f"θ is not finite at {bad}")
+            first = int(np.flatnonzero(~finite)[0])
+            raise ParameterError(f"θ is not finite at {self.blocks.labels[first]}")
         # θ is shared by controllers and logs: who changes it makes a new one.
         theta.flags.writeable = False
         object.__setattr__(self, "theta", theta)
 
     def __getitem__(self, name: str) -> Vector:
-        return self.blocks.block(name).unpack(self.theta[self.blocks.slices[name]])
+        block = self.blocks.block(name)
+        packed = self.theta[self.blocks.slices[name]]
+        return block.unpack(packed)
 
     def _facts(self) -> dict[str, object]:
         return {
@@ -287,7 +322,9 @@ class Parameters(Shown):
         values = {block.name: self[block.name] for block in self.blocks}
         if "p" in values:
             # Estimated disturbances are the last entries of p.
-            values["p"] = np.concatenate([values["p"], other["p"][values["p"].size :]])
+            p = values["p"]
+            end = other["p"][p.size :]
+            values["p"] = np.concatenate([p, end])
         return other.replace(values)
 
     def with_theta(self, theta: ArrayLike) -> Parameters:
@@ -296,11 +333,16 @@ class Parameters(Shown):
 
     def require_well_posed(self) -> None:
         """Raise ParameterError on an x_l not below its x_u or a slack weight not positive."""
-        if not (self["x_l"] < self["x_u"]).all():
-            raise ParameterError(f"θ: x_l = {self['x_l']} must stay below x_u = {self['x_u']}")
+        lower = self["x_l"]
+        upper = self["x_u"]
+        if not (lower < upper).all():
+            raise ParameterError(f"θ: x_l = {lower} must stay below x_u = {upper}")
         for name in ("w_sigma", "W_sigma"):
-            if name in self.blocks and not (self[name] > 0).all():
-                raise ParameterError(f"θ: {name} = {self[name]} must be positive")
+            if name not in self.blocks:
+                continue
+            weights = self[name]
+            if not (weights > 0).all():
+                raise ParameterError(f"θ: {name} = {weights} must be positive")
 
     @property
     def hash(self) -> str:
@@ -308,8 +350,10 @@ class Parameters(Shown):
         # Hexadecimal, so that the hash is of the exact values and not of their rounding to
         # decimals.
         values = [float(value).hex() for value in self.theta]
-        content = json.dumps([list(self.blocks.labels), values])
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
+        names = list(self.blocks.labels)
+        content = json.dumps([names, values])
+        digest = hashlib.sha256(content.encode())
+        return digest.hexdigest()[:16]
 
     @classmethod
     def naive(cls, problem: Problem, blocks: ThetaBlocks | None = None) -> Parameters:
@@ -333,16 +377,22 @@ class Parameters(Shown):
             values["w_sigma"] = problem.penalty_linear
             values["W_sigma"] = problem.penalty_quadratic
         if "p" in blocks:
-            chosen = problem.model.parameter_indices(blocks.block("p").labels)
+            names = blocks.block("p").labels
+            chosen = problem.model.parameter_indices(names)
             values["p"] = problem.model.nominal_parameters[chosen]
-        return cls(blocks, np.zeros(blocks.size)).replace(values)
+        zero = cls(blocks, np.zeros(blocks.size))
+        return zero.replace(values)
 
     def to_toml(self) -> str:
         """θ as TOML with schema version and hash."""
-        values = {block.name: self[block.name].tolist() for block in self.blocks}
-        document: dict[str, Any] = {"schema": 1, "hash": self.hash, "theta": values}
+        document: dict[str, Any] = {
+            "schema": 1,
+            "hash": self.hash,
+            "theta": {block.name: self[block.name].tolist() for block in self.blocks},
+        }
         if "p" in self.blocks:
-            document["model_parameters"] = list(self.blocks.block("p").labels)
+            names = self.blocks.block("p").labels
+            document["model_parameters"] = list(names)
         return tomli_w.dumps(document)
 
     def save(self, path: str | Path) -> Path:
@@ -392,7 +442,8 @@ class Parameters(Shown):
                     f"θ blocks missing: {', '.join(missing) or 'none'}; "
                     f"not known: {', '.join(unknown) or 'none'}"
                 )
-            parameters = cls(blocks, np.zeros(blocks.size)).replace(values)
+            zero = cls(blocks, np.zeros(blocks.size))
+            parameters = zero.replace(values)
         except (ModelError, ParameterError) as error:
             raise ParameterError(f"{path}: {error}") from error
         # An edit by hand is caught, unless it is said to be meant.
@@ -422,16 +473,23 @@ def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
         part = theta[blocks.slices[block.name]]
         if block.symmetric:
             # Where each of the matrix's entries is among the packed ones.
-            place = block.unpack(np.arange(float(block.size))).astype(int)
-            part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
+            numbers = np.arange(float(block.size))
+            places = block.unpack(numbers).astype(int)
+            entries = part[places.reshape(-1).tolist()]
+            part = ca.reshape(entries, *block.shape)
         symbols[block.name] = part
+
     # So that what reads the weights need not ask whether they are learned.
-    symbols.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
-    symbols.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
-    parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
+    if "w_sigma" not in blocks:
+        symbols["w_sigma"] = ca.SX(ca.DM(problem.penalty_linear))
+        symbols["W_sigma"] = ca.SX(ca.DM(problem.penalty_quadratic))
+
+    # Parameters that θ does not hold stay at their nominal values.
+    model = problem.model
+    parameters = ca.SX(ca.DM(model.nominal_parameters))
     if "p" in blocks:
-        indices = problem.model.parameter_indices(blocks.block("p").labels)
-        for i, index in enumerate(indices):
-            # Those that θ does not hold stay at their nominal values.
+        names = blocks.block("p").labels
+        for i, index in enumerate(model.parameter_indices(names)):
             parameters[index] = symbols["p"][i]
-    return symbols | {"model_parameters": parameters}
+    symbols["model_parameters"] = parameters
+    return symbols

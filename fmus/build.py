@@ -51,10 +51,19 @@ def universal_binary(libraries: Sequence[bytes]) -> bytes:
     table = struct.pack(">II", UNIVERSAL, len(libraries))
     body = b""
     for library in libraries:
-        architecture = struct.unpack_from("<II", library, 4)  # cputype, cpusubtype
-        body += b"\0" * (-len(body) % page)
+        cpu_type, cpu_subtype = struct.unpack_from("<II", library, 4)
+        padding = -len(body) % page
+        body += b"\0" * padding
+        # The table is the first page.
         offset = page + len(body)
-        table += struct.pack(">IIIII", *architecture, offset, len(library), _ALIGNMENT)
+        table += struct.pack(
+            ">IIIII",
+            cpu_type,
+            cpu_subtype,
+            offset,
+            len(library),
+            _ALIGNMENT,
+        )
         body += library
     return table.ljust(page, b"\0") + body
 
@@ -128,7 +137,11 @@ class Compiler:
         # Zig leaves a file where it is called.
         with TemporaryDirectory(prefix="cosim-") as folder:
             result = subprocess.run(
-                [*self.command, "--version"], cwd=folder, capture_output=True, text=True, check=True
+                [*self.command, "--version"],
+                cwd=folder,
+                capture_output=True,
+                text=True,
+                check=True,
             )
         return result.stdout.splitlines()[0]
 
@@ -169,10 +182,15 @@ class Compiler:
             for path, data in sources.items():
                 (folder / path).write_bytes(data)
             # What the runtime's compiler says is not about the sources.
-            for step in filter(None, (self.runtime, command)):
-                result = subprocess.run(
-                    step, cwd=folder, capture_output=True, text=True, check=False
-                )
+            if self.runtime:
+                subprocess.run(self.runtime, cwd=folder, capture_output=True, check=False)
+            result = subprocess.run(
+                command,
+                cwd=folder,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
             if result.returncode != 0 or result.stderr:
                 raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
             return (folder / file).read_bytes()
@@ -193,13 +211,16 @@ def cross_compiler(platform: Platform) -> Compiler:
         raise BuildError("no cross-compiler: pip install 'rti-cosim[cross]'")
     zig = (sys.executable, "-m", "ziglang")
     target = ("-target", platform.target)
+    command = (*zig, "cc", *target)
+    linker_flags = _CROSS_FLAGS[platform.suffix]
     runtime: tuple[str, ...] = ()
     if platform.suffix == ".dll":
         # `zig cc` compiles the C library of Windows file by file; `build-lib` several at once.
         options = ("-dynamic", "-lc", "-OReleaseFast", "-fstrip")
-        jobs = f"-j{2 * (os.cpu_count() or 1)}"
+        cores = os.cpu_count() or 1
+        jobs = f"-j{2 * cores}"
         runtime = (*zig, "build-lib", *target, *options, "empty.c", jobs)
-    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], runtime)
+    return Compiler(platform, command, linker_flags, runtime)
 
 
 def compilers(every_platform: bool) -> list[Compiler]:
@@ -251,14 +272,17 @@ def build_fmu(
     members = {**(files or {}), "modelDescription.xml": text}
     for name, data in sources.items():
         members[f"sources/{name}"] = data
-    macos = [data for platform, data in libraries.items() if platform.suffix == ".dylib"]
+    macos = []
     for platform, library in libraries.items():
         folder = platform.folder(version)
-        name = f"binaries/{folder}/{identifier}{platform.suffix}"
-        # FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both
-        # are built, lies a universal binary.
-        universal = folder == "darwin64" and len(macos) > 1
-        members[name] = universal_binary(macos) if universal else library
+        members[f"binaries/{folder}/{identifier}{platform.suffix}"] = library
+        if platform.suffix == ".dylib":
+            macos.append(library)
+    # FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both
+    # are built, lies a universal binary.
+    shared = f"binaries/darwin64/{identifier}.dylib"
+    if shared in members and len(macos) > 1:
+        members[shared] = universal_binary(macos)
     return write_archive(members, path)
 
 
@@ -296,8 +320,9 @@ def build_folder(
         OSError: if there is no model description.
         BuildError: as `build_fmu`.
     """
-    text = (Path(folder) / "modelDescription.xml").read_bytes()
-    sources = {path.name: path.read_bytes() for path in Path(folder).glob("*.[ch]")}
+    folder = Path(folder)
+    text = (folder / "modelDescription.xml").read_bytes()
+    sources = {path.name: path.read_bytes() for path in folder.glob("*.[ch]")}
     return build_fmu(target, sources, text, every_platform=every_platform)
 
 
@@ -351,22 +376,29 @@ def sources_of(model: FmuModel, version: FmiVersion) -> dict[str, bytes]:
     for name in (*_FACES, f"fmi{version}.c"):
         files[name] = (SOURCES / name).read_bytes()
     # Without derivatives, unless the model has some of its own.
-    files["derivatives.h"] = (PACKAGE / "plant_sources" / "derivatives.h").read_bytes()
+    no_derivatives = PACKAGE / "plant_sources" / "derivatives.h"
+    files["derivatives.h"] = no_derivatives.read_bytes()
     if model.sampled:
         files |= _sampled_sources(model, version)
     files |= model.sources
-    files[HEADER] = c_header(token_of(model, version, files), model).encode()
+
+    # The token is a digest of all of the above; what holds it does not count.
+    token = token_of(model, version, files)
+    files[HEADER] = c_header(token, model).encode()
     files["buildDescription.xml"] = build_description(version, model).encode()
     return files
 
 
 def _sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
+    """The C files of a sampled model: FMI's functions over a table of time, inputs, outputs, …."""
     kinds = [variable.kind for variable in system.variables]
+    # The table begins with time.
     first_output = 1 + kinds.count(Kind.INPUT)
+    first_parameter = first_output + kinds.count(Kind.OUTPUT)
     header = render(
         "system.h",
         first_output=first_output,
-        first_parameter=first_output + kinds.count(Kind.OUTPUT),
+        first_parameter=first_parameter,
         sampling_time=float(system.step_size),
     )
     sources = files_of("sampled_sources")
@@ -377,15 +409,17 @@ def _sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
     elements = dict.fromkeys(range(len(kinds)), (1, 0))
     for array in system.arrays.values():
         references = [system.value_reference(variable.name) for variable in array]
+        following = [*references[1:], references[0]]
         # The first element stands for the array and has its size; each points to the next.
-        for k, reference in enumerate(references):
-            size = len(references) if k == 0 else 0
-            elements[reference] = (size, references[(k + 1) % len(references)])
+        sizes = [len(references)] + [0] * (len(references) - 1)
+        for reference, size, next_reference in zip(references, sizes, following, strict=True):
+            elements[reference] = (size, next_reference)
     adapter = render("arrays.h", model=system, elements=elements.values())
     sources["arrays.h"] = adapter.encode()
     last_include = b'#include "snapshot.h"\n'
+    adapter_include = b'#include "arrays.h"\n'
     scalars = (SOURCES / "fmi3.c").read_bytes()
-    sources["fmi3.c"] = scalars.replace(last_include, last_include + b'#include "arrays.h"\n')
+    sources["fmi3.c"] = scalars.replace(last_include, last_include + adapter_include)
     return sources
 
 
@@ -423,9 +457,14 @@ def build_model(
     if version == 3:
         members |= terminals(model)
     members |= files or {}
-    text = model_description(version, token_of(model, version, sources), model)
+    token = token_of(model, version, sources)
     return build_fmu(
-        target, sources, text, every_platform=every_platform, files=members, warnings=warnings
+        target,
+        sources,
+        model_description(version, token, model),
+        every_platform=every_platform,
+        files=members,
+        warnings=warnings,
     )
 
 
@@ -441,10 +480,14 @@ def token_of(
         version: major version of FMI.
         sources: content by file name; generated files, which hold the token, do not count.
     """
-    digest = hashlib.sha256(model_description(version, "", model).encode())
-    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):
+    # Without a token, which is what is to be found.
+    description = model_description(version, "", model)
+    digest = hashlib.sha256(description.encode())
+    counted = sources.keys() - {HEADER, "buildDescription.xml"}
+    for name in sorted(counted):
         digest.update(name.encode() + b"\0" + sources[name])
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
+    identifier = uuid.UUID(bytes=digest.digest()[:16], version=5)
+    return f"{{{identifier}}}"
 
 
 def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:
@@ -461,14 +504,18 @@ def sampled_table(signals: Sequence[Variable]) -> tuple[Variable, ...]:
         BuildError: if two names are the same, in FMI or in C.
     """
     table = [Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")]
-    known = tuple(signal.name for signal in signals if signal.settable)
+    settable = tuple(signal.name for signal in signals if signal.settable)
     for signal in signals:
-        table.append(signal if signal.settable else replace(signal, uses=known))
+        if signal.settable:
+            table.append(signal)
+        else:
+            table.append(replace(signal, uses=settable))
+
     # In C a name has other signs, so that two names may meet there.
     names = [variable.name for variable in table]
     identifiers = [variable.identifier for variable in table]
-    for known_names in (names, identifiers):
-        for name in known_names:
-            if known_names.count(name) > 1:
+    for taken_names in (names, identifiers):
+        for name in taken_names:
+            if taken_names.count(name) > 1:
                 raise BuildError(f"two variables are called '{name}'")
     return tuple(table)

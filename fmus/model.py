@@ -65,7 +65,8 @@ class Variable:
     @property
     def settable(self) -> bool:
         """Whether an importer gives its value (parameters and inputs)."""
-        return self.kind in (Kind.INPUT, Kind.FIXED, Kind.TUNABLE)
+        given = (Kind.INPUT, Kind.FIXED, Kind.TUNABLE)
+        return self.kind in given
 
     @property
     def identifier(self) -> str:
@@ -136,9 +137,11 @@ def unit(name: str) -> Unit:
     factor = Fraction(1)
     exponents = dict.fromkeys(_BASE, 0)
     for position, part in enumerate(name.split("/")):
-        # The numerator first.
+        # The numerator first; it may be empty.
         sign = -1 if position else 1
-        symbols = part.strip("()").split(".") if part else []
+        symbols = []
+        if part:
+            symbols = part.strip("()").split(".")
         for symbol in symbols:
             match = _POWER.fullmatch(symbol)
             if match is None or match[1] not in _SIMPLE:
@@ -148,7 +151,9 @@ def unit(name: str) -> Unit:
             factor *= Fraction(simple["factor"]) ** power
             for base, exponent in _EXPONENT.findall(simple["exponents"]):
                 exponents[base] += power * int(exponent)
-    offset = Fraction(_SIMPLE[name]["offset"]) if name in _SIMPLE else Fraction(0)
+    offset = Fraction(0)
+    if name in _SIMPLE:
+        offset = Fraction(_SIMPLE[name]["offset"])
     occurring = {base: exponent for base, exponent in exponents.items() if exponent}
     return Unit(name, float(factor), float(offset), occurring)
 
@@ -231,9 +236,10 @@ class FmuModel:
                 shown[variable] = variable
         for name, elements in self.arrays.items():
             # The array says what is common to its elements, and in which order they are.
-            common = commonprefix([element.description for element in elements])  # noqa: RUF071
+            descriptions = [element.description for element in elements]
+            common = commonprefix(descriptions).rstrip(", ")  # noqa: RUF071
             indices = [element.name.removeprefix(name) for element in elements]
-            description = f"{common.rstrip(', ')}: {' '.join(indices)}"
+            description = f"{common}: {' '.join(indices)}"
             first, *others = elements
             shown[first] = replace(first, name=name, description=description)
             for element in others:
@@ -268,7 +274,8 @@ def continuous_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
     if model.by_name[name].kind is Kind.STATE:
         return (name,)
     known = closure(name, model)
-    return tuple(other for other in model.names(Kind.STATE, Kind.INPUT) if other in known)
+    possible = model.names(Kind.STATE, Kind.INPUT)
+    return tuple(other for other in possible if other in known)
 
 
 def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
@@ -284,7 +291,8 @@ def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
         # A state depends on its start parameter.
         if model.by_name[known].kind is Kind.STATE:
             names |= closure(known, model)
-    return tuple(v.name for v in model.variables if v.name in names and v.settable)
+    settable = [variable.name for variable in model.variables if variable.settable]
+    return tuple(name for name in settable if name in names)
 
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -321,7 +329,8 @@ def _template(name: str) -> Any:
 
 
 def _xml(text: str) -> str:
-    return html.escape(text, quote=False).replace('"', "&quot;").replace("\n", "&#10;")
+    escaped = html.escape(text, quote=False)
+    return escaped.replace('"', "&quot;").replace("\n", "&#10;")
 
 
 def _attributes(values: Attributes) -> str:
@@ -365,7 +374,8 @@ def model_description(
         unit_names = list(model.units)
     else:
         # Once, in the order of the table.
-        unit_names = list(dict.fromkeys(v.unit for v in model.variables if v.unit))
+        named = [variable.unit for variable in model.variables if variable.unit]
+        unit_names = list(dict.fromkeys(named))
     variables = []
     for variable in model.exported(version):
         element, attributes = _type(version, variable, model)
@@ -485,10 +495,14 @@ _UNKNOWNS = (
 """FMI 3.0's element of an unknown, FMI 2.0's around them, their kinds, their dependencies."""
 
 
-def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, list[Attributes]]]:
+def _structure(
+    version: FmiVersion,
+    model: FmuModel,
+) -> list[tuple[str, str, list[Attributes]]]:
     """The unknowns of ModelStructure by group, with their dependencies."""
     number = _numbering(version, model)
     reference = "index" if version == 2 else "valueReference"
+    # By the names of the table: FMI 3.0 shows an array in place of its first element.
     shown = {model.by_name[variable.name].name for variable in model.exported(version)}
     structure = []
     for element, group, kinds, dependencies_of in _UNKNOWNS:
@@ -496,13 +510,15 @@ def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, lis
         for name in model.names(*kinds):
             if name not in shown:
                 continue
-            known = [d for d in dependencies_of(name, model) if d in shown]
+            dependencies = [other for other in dependencies_of(name, model) if other in shown]
+            numbers = [str(number(other)) for other in dependencies]
             # The states depend on themselves or on their start with constant factor 1.
-            kind = "constant" if model.by_name[name].kind is Kind.STATE else "dependent"
+            is_state = model.by_name[name].kind is Kind.STATE
+            kind = "constant" if is_state else "dependent"
             unknown = {
                 reference: number(name),
-                "dependencies": " ".join(str(number(dependency)) for dependency in known),
-                "dependenciesKind": " ".join([kind] * len(known)),
+                "dependencies": " ".join(numbers),
+                "dependenciesKind": " ".join([kind] * len(numbers)),
             }
             unknowns.append(unknown)
         if unknowns:
@@ -542,5 +558,6 @@ def _start_and_range(most: float, variable: Variable) -> tuple[float, ...]:
     if variable.type in (Type.SEED, Type.SEED_HIGH):
         low, high = 0.0, 2.0**32 - 1
     nominal = 1.0 if variable.nominal is None else variable.nominal
+    numbers = (variable.start, low, high, nominal)
     # Nothing and −0.0 are written as 0.0.
-    return tuple(float(number or 0.0) for number in (variable.start, low, high, nominal))
+    return tuple(float(number or 0.0) for number in numbers)

@@ -50,7 +50,11 @@ class Core:
     sources: Mapping[str, bytes]
 
 
-def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton") -> Core:
+def core(
+    problem: Problem,
+    parameters: Parameters,
+    hessian: str = "gauss-newton",
+) -> Core:
     """Write the C of an RTI-NMPC: deterministic, without allocation, C99.
 
     It computes as `RtiNmpc` does with the backend `daqp`, by a QP solver of its own; the
@@ -82,7 +86,11 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     return Core(problem, parameters, controller_sources(functions))
 
 
-def controller_sources(functions: SampleFunctions, *, stagewise: bool = False) -> dict[str, bytes]:
+def controller_sources(
+    functions: SampleFunctions,
+    *,
+    stagewise: bool = False,
+) -> dict[str, bytes]:
     """C files of a controller.
 
     Args:
@@ -92,9 +100,17 @@ def controller_sources(functions: SampleFunctions, *, stagewise: bool = False) -
     Returns:
         Contents by file name, the same bytes for the same functions.
     """
-    solver_files = STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER
-    names = ["core.h", "rti.h", *solver_files, "costs.h", "rotation.h", functions.hessian.source]
-    sources = {name: (ENGINE_SOURCES / name).read_bytes() for name in names}
+    names = [
+        "core.h",
+        "rti.h",
+        *(STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER),
+        "costs.h",
+        "rotation.h",
+        functions.hessian.source,
+    ]
+    sources = {}
+    for name in names:
+        sources[name] = (ENGINE_SOURCES / name).read_bytes()
     # The preparation's graph maps the stage's function and is written by hand; stage by stage
     # nothing is condensed, so that no condensed vectors are embedded.
     unused = {"PREPARED", "EMBEDDED"} if stagewise else {"PREPARED"}
@@ -137,11 +153,15 @@ def stack_needed(functions: SampleFunctions) -> int:
     # Numbers in `RtiPrepared` and `RtiSolved`, in `QpWork` with the factorisation's arrays, and in
     # the responses of condensing.
     sample = functions.preparation.memory.size + functions.readout.memory.size
-    solver = limits * (variables + limits + 10) + 2 * limits + variables * (variables + 1)
+    working_set = limits * (variables + limits + 10) + 2 * limits
+    factorisation = variables * (variables + 1)
     condensing = (horizon + 5) * n * (variables + n + 1)
-    work = [sum(work_sizes("", function).values()) for function in _written(functions)]
-    shared = max(solver, condensing, *work)
-    return 4000 + round(1.2 * 8 * (sample + shared))
+    shared = max(working_set + factorisation, condensing)
+    for function in _written(functions):
+        work = sum(work_sizes("", function).values())
+        shared = max(shared, work)
+    bytes_needed = 8 * (sample + shared)
+    return 4000 + round(1.2 * bytes_needed)
 
 
 def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
@@ -174,6 +194,7 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
     sizes |= work_sizes("LINEARISE", functions.stage)
     for name, place in blocks.slices.items():
         sizes[f"THETA_{name}"] = place.start
+    size_lines = [f"    {name} = {value}," for name, value in sizes.items()]
 
     arrays = {
         "REFERENCE_STATE": problem.reference_state,
@@ -183,7 +204,10 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
     }
     # Slack weights are read from θ, or else are constants.
     if "w_sigma" in blocks:
-        slack = {"linear": "((theta) + THETA_w_sigma)", "quadratic": "((theta) + THETA_W_sigma)"}
+        slack = {
+            "linear": "((theta) + THETA_w_sigma)",
+            "quadratic": "((theta) + THETA_W_sigma)",
+        }
     else:
         arrays["PENALTY_LINEAR"] = problem.penalty_linear
         arrays["PENALTY_QUADRATIC"] = problem.penalty_quadratic
@@ -204,11 +228,13 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
         arrays["METRIC"] = rule.metric.reshape(-1)
     arrays["DISCOUNTS"] = problem.discounts[:-1]
     arrays["SLACK_DISCOUNTS"] = problem.discounts[1:]
+    array_lines = [_array_text(name, values) for name, values in arrays.items()]
+    end_discount = float(problem.discounts[-1])
     return _filled(
         "problem.h.in",
-        sizes="\n".join(f"    {name} = {value}," for name, value in sizes.items()),
-        arrays="\n".join(_array_text(name, values) for name, values in arrays.items()),
-        end_discount=repr(float(problem.discounts[-1])),
+        sizes="\n".join(size_lines),
+        arrays="\n".join(array_lines),
+        end_discount=repr(end_discount),
         floor=repr(Exact.FLOOR),
         residual=repr(SOLVED_RESIDUAL),
         cost_scale=repr(problem.scale.cost),
@@ -220,11 +246,14 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
 
 
 def _filled(template: str, **values: str) -> str:
-    return Template((ENGINE_SOURCES / template).read_text(encoding="utf-8")).substitute(values)
+    text = (ENGINE_SOURCES / template).read_text(encoding="utf-8")
+    return Template(text).substitute(values)
 
 
 def _array_text(name: str, values: ArrayLike) -> str:
-    numbers = ", ".join(_number(value) for value in np.asarray(values, dtype=np.float64))
+    # `repr` gives back the same double: a constant in C has no rounding of its own.
+    array = np.asarray(values, dtype=np.float64)
+    numbers = ", ".join(_number(value) for value in array)
     return f"static const double {name}[] = {{{numbers}}};"
 
 
@@ -252,7 +281,13 @@ _SINGLE = (
 )
 
 
-def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) -> dict[str, str]:
+def plain_c(
+    core: Core,
+    name: str,
+    scenario: Scenario,
+    *,
+    single: bool = False,
+) -> dict[str, str]:
     """Text of ``NAME.c``, ``NAME.h``, ``main.c`` and ``CMakeLists.txt`` by file name.
 
     Args:
@@ -275,13 +310,16 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
     guess = horizon * (2 * n + m)
     solution = (horizon + 1) * n + horizon * m + guess + 3
     upper = name.upper()
+    camel_case = "".join(part.capitalize() for part in name.split("_"))
     statuses = []
-    for k, text in enumerate(STATUSES):
-        word = re.sub(r"\W", "_", text.replace("θ", "theta")).upper()
+    for k, status in enumerate(STATUSES):
+        ascii_status = status.replace("θ", "theta")
+        word = re.sub(r"\W", "_", ascii_status).upper()
         statuses.append(f"    {upper}_{word} = {k}")
+    numbers = [repr(value) for value in core.parameters.theta.tolist()]
     values = {
         "name": name,
-        "Name": "".join(part.capitalize() for part in name.split("_")),
+        "Name": camel_case,
         "NAME": upper,
         "title": f"RTI-NMPC for {scenario.name}, theta {core.parameters.hash}",
         "version": version("rti-cosim"),
@@ -293,27 +331,32 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
         "parameters": core.parameters.blocks.size,
         "memory": guess + solution + 2 * m + 2,
         "statuses": ",\n".join(statuses),
-        "theta": ", ".join(repr(value) for value in core.parameters.theta.tolist()),
+        "theta": ", ".join(numbers),
         "core": _joined(core),
     }
     names = {"controller.c": f"{name}.c", "controller.h": f"{name}.h"}
     files = {}
     for path in sorted(PLAIN_TEMPLATES.iterdir()):
-        text = Template(path.read_text(encoding="utf-8")).substitute(values)
+        template = Template(path.read_text(encoding="utf-8"))
+        text = template.substitute(values)
         if single and path.suffix in (".c", ".h"):
             for pattern, replacement in _SINGLE:
                 text = pattern.sub(replacement, text)
-        files[names.get(path.name, path.name)] = text
+        file_name = names.get(path.name, path.name)
+        files[file_name] = text
     return files
 
 
 def _joined(core: Core) -> str:
     """`core.h` with each file that it includes in the place of its first inclusion."""
     files = {name: data.decode() for name, data in core.sources.items()}
+    # Which file stands for a macro, such as the rule of the Hessian, is said in `problem.h`.
     chosen = re.findall(r'#define (\w+_RULE) "([\w.]+)"', files["problem.h"])
     for macro, chosen_name in chosen:
+        by_macro = f"#include {macro}"
+        by_name = f'#include "{chosen_name}"'
         for name, text in files.items():
-            files[name] = text.replace(f"#include {macro}", f'#include "{chosen_name}"')
+            files[name] = text.replace(by_macro, by_name)
     # Files guard themselves by their macros; joined into one text each comes once.
     seen: set[str] = set()
 

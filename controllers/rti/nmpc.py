@@ -22,7 +22,15 @@ from controllers.export.core import (
     stack_needed,
     why_not_in_c,
 )
-from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
+from controllers.functions import (
+    COMPILED,
+    INTERPRETED,
+    LONG,
+    StackedFunction,
+    consecutive,
+    library,
+    switch,
+)
 from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions, Spectrum
 from controllers.problem import Problem
 from controllers.qp import (
@@ -69,7 +77,11 @@ class NmpcFunctions(SampleFunctions):
     def named(self) -> dict[str, StackedFunction]:
         """The functions by the prefix of their constants in C."""
         gradient, make_policy = self.derivatives
-        return super().named | {"GRADIENT": gradient, "POLICY": make_policy()}
+        derivatives = {
+            "GRADIENT": gradient,
+            "POLICY": make_policy(),
+        }
+        return super().named | derivatives
 
     def condense(self, before: Vector, after: Vector) -> None:
         """Write the condensed QP into copies of both memories.
@@ -113,15 +125,21 @@ class Prepared:
     def point(self) -> LinearisationPoint:
         """Where the QP is linearised."""
         horizon = self.functions.problem.horizon
+
+        def stages(name: str) -> Matrix:
+            return self.part(name).reshape(horizon, -1).copy()
+
         return LinearisationPoint(
-            x=self.part("x").reshape(horizon, -1).copy(),
-            u=self.part("u").reshape(horizon, -1).copy(),
-            costates=self.part("costates").reshape(horizon, -1).copy(),
+            x=stages("x"),
+            u=stages("u"),
+            costates=stages("costates"),
         )
 
     def contract(self, seed: Vector) -> Vector:
         """Adjoint of the lift's derivative (`Spectrum.contract`), of the identity without one."""
-        return seed if self.spectrum is None else self.spectrum.contract(seed)
+        if self.spectrum is None:
+            return seed
+        return self.spectrum.contract(seed)
 
 
 @dataclass(eq=False)
@@ -150,7 +168,11 @@ class RtiSolution:
     @cached_property
     def multipliers(self) -> QpSolution:
         """Primal-dual solution of the condensed QP, in units of `Problem.scale`."""
-        return QpSolution(self._part("v"), self._part("nu"), self._part("lam"))
+        return QpSolution(
+            v=self._part("v"),
+            nu=self._part("nu"),
+            lam=self._part("lam"),
+        )
 
     @cached_property
     def qp(self) -> SoftQp:
@@ -164,13 +186,15 @@ class RtiSolution:
     @cached_property
     def predicted_states(self) -> Matrix:
         """Predicted states x_0 … x_N, shape (N+1, n)."""
-        return self._by_stage("xi") + self.prepared.functions.problem.reference_state
+        reference = self.prepared.functions.problem.reference_state
+        return self._by_stage("xi") + reference
 
     @cached_property
     def predicted_actions(self) -> Matrix:
         """Predicted actions u_0 … u_{N−1}, shape (N, m)."""
         problem = self.prepared.functions.problem
-        deviation = self.multipliers.v.reshape(-1, problem.n_actions) * problem.scale.action
+        scaled = self.multipliers.v.reshape(-1, problem.n_actions)
+        deviation = scaled * problem.scale.action
         return np.asarray(deviation + problem.reference_action)
 
     @property
@@ -199,10 +223,13 @@ class RtiSolution:
     @property
     def action_gradient(self) -> Vector:
         """dQ/da, shape (m,): zero where the action was not enforced."""
+        m = self.action.size
         if not self.enforced:
-            return np.zeros(self.action.size)
+            return np.zeros(m)
         price = self.prepared.functions.problem.scale.action_price
-        return np.asarray(-self.multipliers.nu[: self.action.size] * price)
+        # ν of the equation u_0 = a.
+        equation_nu = self.multipliers.nu[:m]
+        return np.asarray(-equation_nu * price)
 
     @property
     def residual(self) -> float:
@@ -212,7 +239,9 @@ class RtiSolution:
     @property
     def iterations(self) -> int | None:
         """Steps of the compiled QP solver; None where another one solved."""
-        return None if self.prepared.engine is None else int(self._part("iterations")[0])
+        if self.prepared.engine is None:
+            return None
+        return int(self._part("iterations")[0])
 
     @cached_property
     def weakly_active(self) -> bool:
@@ -265,26 +294,31 @@ class RtiSolution:
                 return jacobians
 
         # By Python, which solves the KKT system by least squares where LICQ fails.
-        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
         _, make_function = prepared.functions.derivatives
         function = make_function()
         self._write_solution(function)
-        function.inputs["dv"][:] = dv.reshape(-1)
-        function.inputs["dt"][:] = dt.reshape(-1)
-        function.inputs["dlam"][:] = dlam.reshape(-1)
-        if "dM" in function.inputs:
-            dM = curvature_directions(
-                self.qp.rows,
-                dv,
-                self._step_from_point(),
-                prepared.contract,
-                prepared.functions.problem.scale,
-            )
-            function.inputs["dM"][:] = dM.reshape(-1)
+        self._write_directions(function)
         function()
         by_theta = function.part("policy").reshape(m, -1)
         by_state = function.part("state").reshape(m, -1)
         return by_theta.copy(), by_state.copy()
+
+    def _write_directions(self, function: StackedFunction) -> None:
+        """Write the adjoint directions into the inputs of the policy's derivatives."""
+        inputs = function.inputs
+        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, self.action.size)
+        inputs["dv"][:] = dv.reshape(-1)
+        inputs["dt"][:] = dt.reshape(-1)
+        inputs["dlam"][:] = dlam.reshape(-1)
+        if "dM" in inputs:
+            dM = curvature_directions(
+                self.qp.rows,
+                dv,
+                self._step_from_point(),
+                self.prepared.contract,
+                self.prepared.functions.problem.scale,
+            )
+            inputs["dM"][:] = dM.reshape(-1)
 
     def _write_solution(self, function: StackedFunction) -> None:
         """Write this solution and its QP into the inputs of a function of `sensitivities`."""
@@ -296,10 +330,11 @@ class RtiSolution:
         for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
         if "M" in inputs:
-            step = self._step_from_point()
             # The second-order term is ½ΔwᵀLΔw: its derivative by L, pulled back through the lift.
-            seed = step[:, :, None] * step[:, None, :] / 2
-            inputs["M"][:] = prepared.contract(seed).reshape(-1)
+            step = self._step_from_point()
+            outer = step[:, :, None] * step[:, None, :]
+            M = prepared.contract(outer / 2)
+            inputs["M"][:] = M.reshape(-1)
             inputs["guess"][:] = prepared.part("costates")
 
     def _step_from_point(self) -> Matrix:
@@ -352,11 +387,14 @@ class _Batch:
         self.enforced = enforced
         self.theta = theta
         self.points = points
+        # A row that stays NaN has no solution.
         self.actions = np.full((count, m), np.nan)
         self.values = np.full(count, np.nan)
         self.slopes: Vector | None = None
         if derivatives:
-            self.slopes = np.zeros((count, n + size + m + m * (size + n)))
+            of_value = n + size + m
+            of_policy = m * (size + n)
+            self.slopes = np.zeros((count, of_value + of_policy))
 
     def point(self, k: int) -> LinearisationPoint:
         """The point of linearisation of row k."""
@@ -369,9 +407,14 @@ class _Batch:
         self.values[k] = solution.value
         if self.slopes is None:
             return
-        parts = [solution.costates[0], solution.value_gradient, solution.action_gradient]
+        parts = [
+            solution.costates[0],
+            solution.value_gradient,
+            solution.action_gradient,
+        ]
         if not solution.enforced:
-            parts += [solution.policy_jacobian.ravel(), solution.policy_state_jacobian.ravel()]
+            parts.append(solution.policy_jacobian.ravel())
+            parts.append(solution.policy_state_jacobian.ravel())
         # An enforced action has no policy: the end of its row stays zero.
         row = np.concatenate(parts)
         self.slopes[k, : row.size] = row
@@ -384,19 +427,19 @@ class _Batch:
         m = self.actions.shape[1]
         size = self.theta.shape[1]
         # As `engine_batch` lays a row's derivatives out.
-        ends = np.cumsum([n, size, m, m * size])
-        by_state, by_theta, by_action, policy_theta, policy_state = np.split(
-            self.slopes, ends, axis=1
+        places = consecutive(
+            {
+                "state_gradient": n,
+                "value_gradient": size,
+                "action_gradient": m,
+                "policy_jacobian": m * size,
+                "policy_state_jacobian": m * n,
+            }
         )
-        return BatchSolution(
-            action=self.actions,
-            value=self.values,
-            state_gradient=by_state,
-            value_gradient=by_theta,
-            action_gradient=by_action,
-            policy_jacobian=policy_theta.reshape(-1, m, size),
-            policy_state_jacobian=policy_state.reshape(-1, m, n),
-        )
+        parts = {name: self.slopes[:, place] for name, place in places.items()}
+        parts["policy_jacobian"] = parts["policy_jacobian"].reshape(-1, m, size)
+        parts["policy_state_jacobian"] = parts["policy_state_jacobian"].reshape(-1, m, n)
+        return BatchSolution(self.actions, self.values, **parts)
 
 
 NOT_FINITE = STATUSES.index("not finite")
@@ -417,6 +460,7 @@ class Engine:
     def __init__(self, path: str, functions: NmpcFunctions, stagewise: bool) -> None:
         self.stagewise = stagewise
         self._library = ctypes.CDLL(path)
+        # ctypes takes every result for an int, which is too short for these.
         self._library.engine_sizes.restype = ctypes.c_size_t
         self._library.engine_loop_size.restype = ctypes.c_size_t
         self._library.engine_run.restype = ctypes.c_longlong
@@ -424,28 +468,35 @@ class Engine:
         self._before = functions.preparation.memory
         self._after = functions.readout.memory
         self.action: Vector = np.zeros(functions.problem.n_actions)
-        before_size, after_size, work_size = map(self._library.engine_sizes, range(3))
         # CasADi's functions and the C structs share this memory: a size that differs would be a
         # wrong number, not a crash.
-        same = (before_size, after_size) == (self._before.nbytes, self._after.nbytes)
-        assert same, "Python and C lay memory out unlike"
+        message = "Python and C lay memory out unlike"
+        assert self._library.engine_sizes(0) == self._before.nbytes, message
+        assert self._library.engine_sizes(1) == self._after.nbytes, message
 
         # Work of a sample and of other calls: the next feedback needs the preparation's factors.
+        work_size = self._library.engine_sizes(2)
+        loop_size = self._library.engine_loop_size()
         self._arrays = (
-            np.zeros(work_size // 8 + 1),
-            np.zeros(work_size // 8 + 1),
-            np.zeros(self._library.engine_loop_size() // 8 + 1),
+            _room(work_size),
+            _room(work_size),
+            _room(loop_size),
         )
         work, self._other_work, self._loop = map(_pointer, self._arrays)
         before = _pointer(self._before)
         after = _pointer(self._after)
+        action = _pointer(self.action)
         self._value_arguments = (before, work, after, None)
-        self._action_value_arguments = (before, work, after, _pointer(self.action))
+        self._action_value_arguments = (before, work, after, action)
         self._n_states = functions.problem.n_states
         self._n_theta = functions.blocks.size
 
     @classmethod
-    def compile(cls, functions: NmpcFunctions, stagewise: bool | None = None) -> Engine | None:
+    def compile(
+        cls,
+        functions: NmpcFunctions,
+        stagewise: bool | None = None,
+    ) -> Engine | None:
         """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
         Args:
@@ -455,15 +506,18 @@ class Engine:
         """
         if stagewise is None:
             problem = functions.problem
+            width = problem.n_states + problem.n_actions
             # A rule of thumb: where this becomes faster depends on the plant and on θ.
-            long = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
+            long = problem.horizon >= 5 * width
             stagewise = long or stack_needed(functions) > STACK_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
         # Beside what is exported, the engine has derivatives and closed loops.
         for name in ("sensitivities.h", "loop.h", "engine.c"):
             sources[name] = (ENGINE_SOURCES / name).read_bytes()
         path = library(sources)
-        return None if path is None else cls(str(path), functions, stagewise)
+        if path is None:
+            return None
+        return cls(str(path), functions, stagewise)
 
     def agrees(self, functions: NmpcFunctions) -> bool:
         """Whether the compiled functions give what CasADi's interpreter gives, at one state.
@@ -489,23 +543,26 @@ class Engine:
         prepared = functions.preparation
         first = prepared.places["A"].start
         last = prepared.places["r"].stop
-        compiled = prepared.memory[first:last].copy()
+        stages = prepared.memory[first:last]
+        compiled = stages.copy()
         prepared()
-        return _alike(compiled, prepared.memory[first:last])
+        return _alike(compiled, stages)
 
     def _solution_agrees(self, functions: NmpcFunctions) -> bool:
         """Whether the read-out and the value's gradient agree at the solution in the memory."""
         prepared = functions.preparation
         read = functions.readout
-        gradient, _ = functions.derivatives
         compiled = read.stack.copy()
         read()
         same = _alike(compiled, read.stack)
+
+        gradient, _ = functions.derivatives
         for name, values in gradient.inputs.items():
             source = read if name in read.places else prepared
             values[:] = source.part(name)
         gradient()
-        return same and _alike(read.part("gradient"), gradient.stack)
+        compiled_gradient = read.part("gradient")
+        return same and _alike(compiled_gradient, gradient.stack)
 
     def prepare(self) -> int:
         """Preparation phase at the point and θ that the memory holds."""
@@ -556,7 +613,10 @@ class Engine:
         split = m * self._n_theta
         jacobians: Vector = np.empty(split + m * self._n_states)
         failed = self._library.engine_policy(
-            _pointer(before), _pointer(after), self._other_work, _pointer(jacobians)
+            _pointer(before),
+            _pointer(after),
+            self._other_work,
+            _pointer(jacobians),
         )
         if failed:
             return None
@@ -593,9 +653,16 @@ class Engine:
         return reached, fault[0], fault[1]
 
 
+def _room(size: int) -> Vector:
+    """Memory of at least `size` bytes."""
+    return np.zeros(size // 8 + 1)
+
+
 def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
     """Pointer to the numbers of an array, which its caller keeps; null for None."""
-    return None if array is None else ctypes.c_void_p(array.ctypes.data)
+    if array is None:
+        return None
+    return ctypes.c_void_p(array.ctypes.data)
 
 
 class RtiNmpc:
@@ -654,9 +721,11 @@ class RtiNmpc:
         self.iterations = iterations
         self.problem = problem
         self._compilable = hessian == "gauss-newton" and backend == "daqp"
-        horizon = problem.horizon
-        m = problem.n_actions
-        self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
+        self._make_backend: Callable[[], QpBackend]
+        if isinstance(backend, str):
+            self._make_backend = partial(make_backend, backend)
+        else:
+            self._make_backend = backend
         self._functions = NmpcFunctions(problem, parameters.blocks, hessian)
         self._prepare = self._functions.preparation
         self._embed = self._functions.embedding
@@ -664,33 +733,48 @@ class RtiNmpc:
         self._hessian = self._functions.hessian
         self._engine: Engine | None = None
         self._prepared: Prepared | None = None
+        # Status of the engine's last preparation.
         self._status = 0
-
-        # The QP and the point of linearisation are views of the functions' memory.
-        self._qp = self._functions.qp(self._prepare.memory, self._readout.memory)
-        self._action_bounds = (
-            self._scaled(problem.action_lower),
-            self._scaled(problem.action_upper),
-        )
-        self._qp.lower[:], self._qp.upper[:] = np.tile(self._action_bounds, horizon)
-        self._weigh(problem.penalty_linear, problem.penalty_quadratic)
-        self._x = self._prepare.part("x").reshape(horizon, -1)
-        self._u = self._prepare.part("u").reshape(horizon, -1)
-        self._costates = self._prepare.part("costates").reshape(horizon, -1)
-        self._constant = self._prepare.part("constant")
-
-        # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
-        places = self._prepare.places
-        self._point = self._prepare.memory[places["x"].start : places["u"].stop]
-        self._dense = places["H"].start, places["F"].stop
-        places = self._readout.places
-        self._next_point = slice(places["next_x"].start, places["next_u"].stop)
-        self._next_costates = places["next_chi"]
-        self._value_place = places["value"].start
-        self._first_action = slice(places["v"].start, places["v"].start + m)
+        self._view_memory()
         self.parameters = parameters
         self.functions = INTERPRETED
         self.reset()
+
+    def _view_memory(self) -> None:
+        """Name the parts of the functions' memory that hold the QP, its point and its solution."""
+        problem = self.problem
+        horizon = problem.horizon
+        prepare = self._prepare
+        self._qp = self._functions.qp(prepare.memory, self._readout.memory)
+        action_lower = self._scaled(problem.action_lower)
+        action_upper = self._scaled(problem.action_upper)
+        self._action_bounds = (action_lower, action_upper)
+        # The actions' bounds stay, but for those of u_0, which an enforced action replaces.
+        self._qp.lower[:] = np.tile(action_lower, horizon)
+        self._qp.upper[:] = np.tile(action_upper, horizon)
+        # The slack's weights in units of `Problem.scale`: a cost for each unit of a state, and of
+        # its square; and how much the rows of the stages 1 … N weigh, (Nn,).
+        scale = problem.scale
+        self._price = scale.state_price
+        self._quadratic_unit = scale.state / self._price
+        self._slack_discounts = np.repeat(problem.discounts[1:], problem.n_states)
+        self._weigh(problem.penalty_linear, problem.penalty_quadratic)
+        self._x = prepare.part("x").reshape(horizon, -1)
+        self._u = prepare.part("u").reshape(horizon, -1)
+        self._costates = prepare.part("costates").reshape(horizon, -1)
+        self._constant = prepare.part("constant")
+
+        # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
+        prepared = prepare.places
+        point = slice(prepared["x"].start, prepared["u"].stop)
+        self._point = prepare.memory[point]
+        self._dense = slice(prepared["H"].start, prepared["F"].stop)
+        read = self._readout.places
+        self._next_point = slice(read["next_x"].start, read["next_u"].stop)
+        self._next_costates = read["next_chi"]
+        self._value_place = read["value"].start
+        first = read["v"].start
+        self._first_action = slice(first, first + problem.n_actions)
 
     def compile(self, samples: int = LONG) -> None:
         """Compile for a run of `samples`, if it is long enough; call this before the first sample.
@@ -739,17 +823,18 @@ class RtiNmpc:
     def parameters(self, parameters: Parameters) -> None:
         # The constructor sets θ through here too, when there is none yet.
         current = getattr(self, "_parameters", parameters)
-        if parameters.blocks is not current.blocks and parameters.blocks != current.blocks:
+        blocks = parameters.blocks
+        if blocks is not current.blocks and blocks != current.blocks:
             raise ParameterError(
                 "θ has other blocks than the controller was built with: "
-                f"{', '.join(parameters.blocks.slices)}; build a new controller for it"
+                f"{', '.join(blocks.slices)}; build a new controller for it"
             )
         parameters.require_well_posed()
         self._parameters = parameters
         # All that depends on θ alone is written here; the rest is the next preparation's.
         self._hessian.set_parameters(parameters)
         self._prepare.inputs["theta"][:] = parameters.theta
-        if "w_sigma" in parameters.blocks:
+        if "w_sigma" in blocks:
             self._weigh(parameters["w_sigma"], parameters["W_sigma"])
         self._prepared = None
 
@@ -771,6 +856,7 @@ class RtiNmpc:
         self._costates[:] = 0.0
         self._pending: RtiSolution | None = None
         self._prepared = None
+        # A backend may remember: a new one does not.
         self._backend = self._make_backend()
 
     def prepare(self) -> None:
@@ -799,7 +885,8 @@ class RtiNmpc:
         arrays = [np.asarray(values, dtype=np.float64) for values in point]
         for name, target, array in zip(point._fields, targets, arrays, strict=True):
             # A sum is finite only if all of its terms are, and costs less than NumPy's test.
-            if array.shape != target.shape or not isfinite(sum(array.reshape(-1).tolist())):
+            total = sum(array.reshape(-1).tolist())
+            if array.shape != target.shape or not isfinite(total):
                 raise ControllerError(
                     f"linearisation point: {name} must be finite with shape {target.shape}, "
                     f"not {array.shape}"
@@ -809,24 +896,31 @@ class RtiNmpc:
 
     def _linearise_at(self, point: LinearisationPoint) -> None:
         """Make a point the guess and linearise there."""
-        self._x[:], self._u[:], self._costates[:] = point
+        self._set_point(point)
         self._linearise()
+
+    def _set_point(self, point: LinearisationPoint) -> None:
+        """Make a point the guess, at which the next QP is linearised."""
+        self._x[:] = point.x
+        self._u[:] = point.u
+        self._costates[:] = point.costates
 
     def _weigh(self, w: Vector, W: Vector) -> None:
         """Give the slack of the predicted stages its weights (n,), discounted."""
-        problem = self.problem
-        price = problem.scale.state_price
-        discounts = np.repeat(problem.discounts[1:], problem.n_states)
+        horizon = self.problem.horizon
+        linear = w / self._price
+        quadratic = W * self._quadratic_unit
         # Make new views: a backend recognises new weights by them.
         self._qp.w = self._prepare.part("w")
         self._qp.W = self._prepare.part("W")
-        self._qp.w[:] = discounts * np.tile(w / price, problem.horizon)
-        self._qp.W[:] = discounts * np.tile(W * (problem.scale.state / price), problem.horizon)
+        self._qp.w[:] = self._slack_discounts * np.tile(linear, horizon)
+        self._qp.W[:] = self._slack_discounts * np.tile(quadratic, horizon)
 
     def _scaled(self, action: Vector) -> Vector:
         """The QP's variables that stand for an action (m,)."""
         problem = self.problem
-        return np.asarray((action - problem.reference_action) / problem.scale.action)
+        deviation = action - problem.reference_action
+        return np.asarray(deviation / problem.scale.action)
 
     def _linearise(self) -> None:
         """Make the QP at the guess and factorise it."""
@@ -857,10 +951,10 @@ class RtiNmpc:
         source = self._prepare.memory
         if engine is not None and engine.stagewise:
             # All but the dense matrices, most of the memory, which were not condensed.
-            first, last = self._dense
+            dense = self._dense
             memory = np.empty_like(source)
-            memory[:first] = source[:first]
-            memory[last:] = source[last:]
+            memory[: dense.start] = source[: dense.start]
+            memory[dense.stop :] = source[dense.stop :]
         else:
             memory = source.copy()
         return Prepared(memory, self._hessian.spectrum, self._functions, engine)
@@ -869,7 +963,11 @@ class RtiNmpc:
         """An error with a copy of the QP, which compiled code may have left uncondensed."""
         self._prepare()
         self._embed()
-        return QpError(message + self._hint(), status=status, qp=self._qp.copy())
+        return QpError(
+            message + self._hint(),
+            status=status,
+            qp=self._qp.copy(),
+        )
 
     def _hint(self) -> str:
         """What may be the cause of a QP without a solution: a coarse integration."""
@@ -923,18 +1021,21 @@ class RtiNmpc:
     def _solve_qp(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         """Solve the prepared QP for a state; raises QpError where it is not solved."""
         problem = self.problem
+        # Check before anything is written: a wrong shape leaves the controller as it was.
         state = _vector("state", s, problem.reference_state.size)
+        action = None
+        if a is not None:
+            action = _vector("action", a, problem.reference_action.size)
         if self._prepared is None:
             self.prepare()
         prepared = self._prepared
         assert prepared is not None
         self._readout.inputs["s"][:] = state
-        # Check before anything is written: a wrong shape leaves the controller as it was.
-        action = None if a is None else _vector("action", a, problem.reference_action.size)
         try:
             if self._engine is None:
                 finite = self._solve_interpreted(action)
             else:
+                # The status of a preparation that failed is that of the feedback.
                 status = self._solve_compiled(self._engine, action)
                 finite = status != NOT_FINITE
                 if status not in (0, NOT_FINITE):
@@ -958,8 +1059,9 @@ class RtiNmpc:
         problem = self.problem
         # One copy keeps the whole solution; the next feedback writes over the memory.
         memory = self._readout.memory.copy()
+        deviation = memory[self._first_action] * problem.scale.action
         return RtiSolution(
-            action=memory[self._first_action] * problem.scale.action + problem.reference_action,
+            action=deviation + problem.reference_action,
             value=float(memory[self._value_place]),
             prepared=prepared,
             memory=memory,
@@ -983,24 +1085,31 @@ class RtiNmpc:
         # A solver would loop or crash on numbers that are not finite.
         if not self._embed_state(a):
             return False
-        self._accept(self._backend.solve(self._qp), enforced=a is not None)
+        solution = self._backend.solve(self._qp)
+        self._accept(solution, enforced=a is not None)
         return True
 
     def _embed_state(self, a: Vector | None) -> bool:
         """Put the state, and an action to enforce, into the QP; whether all is finite."""
-        qp = self._qp
         m = self.problem.n_actions
         self._embed()
-        qp.lower[:m], qp.upper[:m] = self._action_bounds
-        if a is not None:
-            qp.lower[:m] = qp.upper[:m] = self._scaled(a)
         self._readout.inputs["constant"][0] = self._constant[0]
-        return self._embed.finite() and (a is None or all(map(isfinite, a.tolist())))
+        # The bounds of u_0 may still be an action that the last feedback enforced.
+        lower, upper = self._action_bounds
+        if a is not None:
+            lower = upper = self._scaled(a)
+        self._qp.lower[:m] = lower
+        self._qp.upper[:m] = upper
+        finite = self._embed.finite()
+        if a is not None:
+            finite = finite and all(map(isfinite, a.tolist()))
+        return finite
 
     def _accept(self, solution: QpSolution, *, enforced: bool) -> None:
         """Read a solution out, polished if need be; raises QpError where it is inaccurate."""
         residual = self._read(solution, enforced)
         if not residual <= ACCURATE_RESIDUAL:
+            # Most solutions are accurate at once and need no Newton step.
             residual = self._read(polish(self._qp, solution), enforced)
         if not residual <= SOLVED_RESIDUAL:
             raise QpError(
@@ -1029,20 +1138,27 @@ class RtiNmpc:
         since what that leaves unsolved is solved in Python, in a subclass that samples otherwise,
         and where the scenario saturates otherwise than the problem.
         """
-        if self._engine is None or self._engine.stagewise or self.iterations > 1:
+        engine = self._engine
+        problem = self.problem
+        if engine is None or engine.stagewise or self.iterations > 1:
             return None
         # A subclass that overrides a phase would be passed over by the loop in C.
         kind = type(self)
-        if kind.prepare is not RtiNmpc.prepare or kind.feedback is not RtiNmpc.feedback:
+        same_prepare = kind.prepare is RtiNmpc.prepare
+        same_feedback = kind.feedback is RtiNmpc.feedback
+        if not (same_prepare and same_feedback):
             return None
         for name in ("action_lower", "action_upper", "reference_action"):
-            if not np.array_equal(getattr(scenario, name), getattr(self.problem, name)):
+            of_scenario = getattr(scenario, name)
+            of_problem = getattr(problem, name)
+            if not np.array_equal(of_scenario, of_problem):
                 return None
-        if len(scenario.plant.states) != self.problem.n_states:
+        # A plant may have more states than the model, which the loop in C does not pick.
+        if len(scenario.plant.states) != problem.n_states:
             return None
         self.reset()
-        self._engine.begin()
-        return self._engine.run
+        engine.begin()
+        return engine.run
 
     # read-outs that leave the guess alone -------------------------------------------------------
 
@@ -1077,26 +1193,30 @@ class RtiNmpc:
         """
         if self._prepared is None:
             self.prepare()
-        problem = self.problem
-        n = problem.n_states
+        n = self.problem.n_states
+        m = self.problem.n_actions
         if np.ndim(states) != 2:
             raise ControllerError(f"the states must have shape (K, {n}), not {np.shape(states)}")
         count = len(np.asarray(states))
+        actions = None
+        if enforced is not None:
+            actions = _batch_rows("actions", enforced, count, (m,))
+        if theta is None:
+            theta = self.theta
         guess = self._guess()
-        given = guess if points is None else points
+        if points is None:
+            points = guess
+        point_rows = []
+        for part, present in zip(points, guess, strict=True):
+            point_rows.append(_batch_rows("points", part, count, present.shape))
         batch = _Batch(
             _batch_rows("states", states, count, (n,)),
-            None
-            if enforced is None
-            else _batch_rows("actions", enforced, count, (problem.n_actions,)),
-            _batch_rows("θ", self.theta if theta is None else theta, count, self.theta.shape),
-            LinearisationPoint(
-                x=_batch_rows("points", given[0], count, guess.x.shape),
-                u=_batch_rows("points", given[1], count, guess.u.shape),
-                costates=_batch_rows("points", given[2], count, guess.costates.shape),
-            ),
+            actions,
+            _batch_rows("θ", theta, count, self.theta.shape),
+            LinearisationPoint(*point_rows),
             derivatives=derivatives,
         )
+
         # Python solves what compiled code does not, one row after the other.
         rest = np.arange(count)
         if self._engine is not None and self.iterations == 1:
@@ -1111,7 +1231,11 @@ class RtiNmpc:
 
     def _guess(self) -> LinearisationPoint:
         """A copy of the point of linearisation."""
-        return LinearisationPoint(self._x.copy(), self._u.copy(), self._costates.copy())
+        return LinearisationPoint(
+            x=self._x.copy(),
+            u=self._u.copy(),
+            costates=self._costates.copy(),
+        )
 
     def _solve_rows(self, batch: _Batch, rows: Iterable[int]) -> None:
         """Solve rows of a batch one after the other, then be as before."""
@@ -1126,7 +1250,8 @@ class RtiNmpc:
                     self._pending = None
                     self._linearise_at(batch.point(k))
                     a = None if batch.enforced is None else batch.enforced[k]
-                    batch.write(k, self._solve(batch.states[k], a))
+                    solution = self._solve(batch.states[k], a)
+                    batch.write(k, solution)
         finally:
             self.parameters = parameters
             self._linearise_at(guess)
@@ -1152,14 +1277,28 @@ def _alike(one: Vector, other: Vector) -> bool:
     """Whether two vectors are equal but for rounding, relative to the largest entry."""
     # Optimised code may round otherwise; a lost result is off by its own size.
     size = float(np.abs(other).max(initial=0.0))
-    return bool(np.allclose(one, other, rtol=0.0, atol=1e-9 * size, equal_nan=True))
+    same = np.allclose(
+        one,
+        other,
+        rtol=0.0,
+        atol=1e-9 * size,
+        equal_nan=True,
+    )
+    return bool(same)
 
 
-def _batch_rows(kind: str, values: ArrayLike, count: int, shape: tuple[int, ...]) -> Vector:
+def _batch_rows(
+    kind: str,
+    values: ArrayLike,
+    count: int,
+    shape: tuple[int, ...],
+) -> Vector:
+    """Rows (count, *shape) of values that have this shape, or are one row for all."""
     rows = np.asarray(values, dtype=np.float64)
-    if rows.shape not in (shape, (count, *shape)):
-        raise ControllerError(f"the {kind} must have shape {(count, *shape)}, not {rows.shape}")
-    return np.ascontiguousarray(np.broadcast_to(rows, (count, *shape)))
+    batch_shape = (count, *shape)
+    if rows.shape not in (shape, batch_shape):
+        raise ControllerError(f"the {kind} must have shape {batch_shape}, not {rows.shape}")
+    return np.ascontiguousarray(np.broadcast_to(rows, batch_shape))
 
 
 def _vector(kind: str, values: ArrayLike, size: int) -> Vector:

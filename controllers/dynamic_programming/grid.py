@@ -1,0 +1,259 @@
+"""A grid of states: its axes, and interpolation on it by cubics and linear functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.protocols import Array
+
+Indices = NDArray[np.intp]
+CUBIC_POINTS = 4
+"""Points of an axis that a cubic goes through."""
+
+
+class AxisInterpolant:
+    """Polynomials through the points of an axis: cubic in the cells within `smooth`, linear else.
+
+    In cell c, x = axis[c] + t, the weight of point `first`[c] + j is Σ_i `weights`[i, j, c] tⁱ,
+    `weights` (powers, stencil points, cells). A cell's cubic runs through its ends and the next
+    point on either side. No cubic uses a point outside `smooth`, where there may be a kink; fewer
+    than four points within leave all linear.
+    """
+
+    def __init__(self, axis: Array, smooth: tuple[float, float] | None) -> None:
+        n_points = len(axis)
+        n_cells = n_points - 1
+        cubic = _cells_within(axis, smooth)
+        any_cubic = cubic.sum() >= CUBIC_POINTS - 1
+        stencil_size = CUBIC_POINTS if any_cubic else 2
+
+        # The stencil is about the cell, but within the axis, and a cubic's within the smooth part.
+        centred = np.arange(n_cells) - (stencil_size // 2 - 1)
+        first = np.clip(centred, 0, n_points - stencil_size)
+        if any_cubic:
+            cubic_cells = np.flatnonzero(cubic)
+            last_first = cubic_cells[-1] + 2 - CUBIC_POINTS
+            first[cubic] = np.clip(first[cubic], cubic_cells[0], last_first)
+
+        weights = np.zeros((stencil_size, stencil_size, n_cells))
+        for c in range(n_cells):
+            points = range(c, c + 2)
+            if any_cubic and cubic[c]:
+                points = range(first[c], first[c] + CUBIC_POINTS)
+            for j in points:
+                polynomial = _lagrange_polynomial(axis, j, points, axis[c])
+                n_powers = len(polynomial)
+                weights[:n_powers, j - first[c], c] = polynomial
+
+        self.axis = axis
+        self.first = first
+        self.weights = weights
+
+    def locate(self, x: Array) -> tuple[Indices, Array]:
+        """Cells of coordinates and offsets in them; outside the axis, those of its ends."""
+        lowest = self.axis[0]
+        highest = self.axis[-1]
+        inside = np.clip(x, lowest, highest)
+        inner_points = self.axis[1:-1]
+        cell = np.searchsorted(inner_points, inside, side="right")
+        offset = inside - self.axis[cell]
+        return cell, offset
+
+
+def _cells_within(axis: Array, interval: tuple[float, float] | None) -> NDArray[np.bool_]:
+    """Which cells of an axis lie in an interval, up to rounding; none where it is None."""
+    if interval is None:
+        return np.zeros(len(axis) - 1, dtype=bool)
+    lower, upper = interval
+    tolerance = 1e-9 * (axis[-1] - axis[0])
+    begins_within = axis[:-1] >= lower - tolerance
+    ends_within = axis[1:] <= upper + tolerance
+    return np.asarray(begins_within & ends_within)
+
+
+def _lagrange_polynomial(
+    axis: Array,
+    j: int,
+    points: Sequence[int],
+    origin: float,
+) -> Array:
+    """Coefficients, in powers of x − origin, of the polynomial that is 1 at axis[j], 0 at others.
+
+    The others are the points of the axis with the indices `points`.
+    """
+    polynomial = np.ones(1)
+    for k in points:
+        if k == j:
+            continue
+        # The factor (x − axis[k]) / (axis[j] − axis[k]).
+        width = axis[j] - axis[k]
+        constant = (origin - axis[k]) / width
+        slope = 1 / width
+        polynomial = np.convolve(polynomial, [constant, slope])
+    return polynomial
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The product of increasing axes, one per state, at least two points each.
+
+    `smooth` has an interval per state in which interpolation is cubic; elsewhere it is multilinear.
+    Weights sum to one; multilinear ones are non-negative too, as those of a Markov chain. A state
+    outside the box is moved to the nearest one inside.
+    """
+
+    axes: tuple[Array, ...]
+    smooth: tuple[tuple[float, float], ...] | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of points per state."""
+        return tuple(len(axis) for axis in self.axes)
+
+    @property
+    def size(self) -> int:
+        """Number of grid states G."""
+        return int(np.prod(self.shape))
+
+    @cached_property
+    def points(self) -> Array:
+        """Grid states, shape (G, n), the last state running fastest."""
+        mesh = np.meshgrid(*self.axes, indexing="ij")
+        columns = [coordinate.reshape(-1) for coordinate in mesh]
+        return np.stack(columns, axis=1)
+
+    def nearest(self, state: Sequence[float] | Array) -> int:
+        """Index of the grid state nearest to `state` in each coordinate."""
+        index = []
+        for axis, x in zip(self.axes, state, strict=True):
+            distance = np.abs(axis - x)
+            index.append(int(distance.argmin()))
+        return int(np.ravel_multi_index(index, self.shape))
+
+    def weights(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
+        """Grid indices and weights of interpolation at states given as one array per entry."""
+        # The empty product: one corner, at index 0, of weight 1.
+        origin: Indices = np.zeros((), dtype=np.intp)
+        corners: list[tuple[Indices, Array]] = [(origin, np.ones(()))]
+        for interpolant, values in zip(self._interpolants, x, strict=True):
+            n_points = len(interpolant.axis)
+            cell, offset = interpolant.locate(values)
+            first = interpolant.first[cell]
+            stencil = []
+            for j in range(interpolant.weights.shape[1]):
+                factor = _horner(interpolant.weights[:, j], cell, [offset])
+                stencil.append((first + j, factor))
+            # Each corner so far has one successor for each point of this axis' stencil.
+            extended = []
+            for index, weight in corners:
+                for position, factor in stencil:
+                    index_here = index * n_points + position
+                    weight_here = weight * factor
+                    extended.append((index_here, weight_here))
+            corners = extended
+        return corners
+
+    def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
+        """Function that interpolates `values` (G,) at states given as one array per entry."""
+        # Coefficients of the polynomial of each cell: one axis after the other.
+        table = values.reshape(self.shape)
+        for interpolant in self._interpolants:
+            stencil_size = interpolant.weights.shape[1]
+            stencil = interpolant.first + np.arange(stencil_size)[:, None]
+            # The first axis becomes (power, cell), and both go last.
+            table = np.einsum("ijc,jc...->...ic", interpolant.weights, table[stencil])
+
+        # Powers first, as `_horner` reads them; the cells behind them become one axis.
+        n = len(self.axes)
+        powers = range(0, 2 * n, 2)
+        cells = range(1, 2 * n, 2)
+        table = table.transpose(*powers, *cells)
+        n_powers = table.shape[:n]
+        table = np.ascontiguousarray(table.reshape(*n_powers, -1))
+
+        def function(x: Sequence[Array]) -> Array:
+            index: Indices = np.zeros((), dtype=np.intp)
+            offsets = []
+            for interpolant, entry in zip(self._interpolants, x, strict=True):
+                cell, offset = interpolant.locate(entry)
+                n_cells = len(interpolant.axis) - 1
+                index = index * n_cells + cell
+                offsets.append(offset)
+            return _horner(table, index, offsets)
+
+        return function
+
+    @cached_property
+    def _interpolants(self) -> list[AxisInterpolant]:
+        smooth = self.smooth or (None,) * len(self.axes)
+        interpolants = []
+        for axis, interval in zip(self.axes, smooth, strict=True):
+            interpolants.append(AxisInterpolant(axis, interval))
+        return interpolants
+
+
+def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
+    """Polynomial in `offsets` of the coefficients `table[i, j, …, index]`, by Horner's rule."""
+    if not offsets:
+        return np.asarray(table[index])
+    first, *rest = offsets
+    total = _horner(table[-1], index, rest)
+    for part in table[-2::-1]:
+        total = total * first + _horner(part, index, rest)
+    return total
+
+
+Feature = tuple[float, float, float]
+"""First and last point of an interval of an axis, and the width that its cells shall not exceed."""
+
+
+def graded_axis(
+    marks: Sequence[float],
+    features: Sequence[Feature],
+    growth: float,
+) -> Array:
+    """Axis through all `marks`, dense at features, each cell outwards about `growth` times wider.
+
+    The width of a cell at x is the least over the features of spacing + (growth − 1)·distance.
+
+    Args:
+        marks: Points of the axis, increasing: the first and last ones are its ends.
+        features: Where the axis is dense.
+        growth: Ratio of the widths of neighbouring cells, above 1.
+    """
+    pieces = [_graded_piece(lower, upper, features, growth) for lower, upper in pairwise(marks)]
+    end = np.array([marks[-1]])
+    return np.concatenate([*pieces, end])
+
+
+def _graded_piece(
+    lower: float,
+    upper: float,
+    features: Sequence[Feature],
+    growth: float,
+) -> Array:
+    """The points of `graded_axis` between two marks, the lower one included."""
+    # The wanted width of a cell, as a function of its place, on a fine partition.
+    fine = np.linspace(lower, upper, 4001)
+    middle = 0.5 * (fine[1:] + fine[:-1])
+    width = np.full(len(middle), upper - lower)
+    for first, last, spacing in features:
+        outside = np.maximum(first - middle, middle - last)
+        distance = np.maximum(outside, 0.0)
+        allowed = spacing + (growth - 1.0) * distance
+        np.minimum(width, allowed, out=width)
+
+    # Number of cells from `lower` to each point, the integral of 1/width. The axis has the points
+    # where it is a whole number, after the last count is rounded up to one.
+    increments = np.diff(fine) / width
+    count = np.append(0.0, np.cumsum(increments))
+    n_cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
+    whole = np.arange(1, n_cells) * (count[-1] / n_cells)
+    inner = np.interp(whole, count, fine)
+    return np.append(lower, inner)

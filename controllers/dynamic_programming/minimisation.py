@@ -1,0 +1,147 @@
+"""Many small minimisations at once: of B functions of m variables in a box."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+
+from controllers.dynamic_programming.grid import Indices
+from cosim.core.protocols import Array
+
+Objective = Callable[[Indices, Array], Array]
+
+
+def nelder_mead(
+    objective: Objective,
+    start: Array,
+    size: Array,
+    lower: Array,
+    upper: Array,
+    *,
+    iterations: int,
+    precision: float,
+) -> tuple[Array, Array]:
+    """Minimise B functions of m variables in a box, each from its own start.
+
+    Nelder and Mead (1965), projected on the box; SciPy's minimises one function at a time. The
+    expected penalty of a nearly deterministic plant has no derivative.
+
+    Args:
+        objective: `objective(rows, points)` evaluates functions `rows` (r,) at points (r, m).
+        start: Starts, (B, m).
+        size: Edges of the first simplices, (B, m).
+        lower: Lower bounds of the box, (m,).
+        upper: Upper bounds, (m,).
+        iterations: Most iterations.
+        precision: A function is done when its simplex's values lie so close to each other.
+
+    Returns:
+        Minimisers (B, m) and values (B,), never worse than the start.
+    """
+    m = start.shape[1]
+    every_row = np.arange(len(start))
+    vertices = _first_simplices(start, size, lower, upper)
+    columns = [objective(every_row, vertices[:, i]) for i in range(m + 1)]
+    values = np.stack(columns, axis=1)
+
+    for _ in range(iterations):
+        # The best vertex first, the worst one last.
+        order = np.argsort(values, axis=1, kind="stable")
+        values = np.take_along_axis(values, order, axis=1)
+        vertices = np.take_along_axis(vertices, order[:, :, None], axis=1)
+        spread = values[:, -1] - values[:, 0]
+        rows = np.flatnonzero(spread > precision)
+        if not len(rows):
+            break
+        best = values[rows, 0]
+        second_worst = values[rows, -2]
+        worst = values[rows, -1]
+
+        # Reflect the worst vertex at the centre of the others.
+        worst_vertex = vertices[rows, -1]
+        centre = vertices[rows, :-1].mean(axis=1)
+        candidate = np.clip(2.0 * centre - worst_vertex, lower, upper)
+        reflected = objective(rows, candidate)
+        is_best = reflected < best
+        is_accepted = reflected < second_worst
+
+        # Expansion, outside contraction and inside contraction as multiples of centre − worst.
+        contraction = np.where(reflected < worst, 0.5, -0.5)
+        factor = np.where(is_best, 2.0, contraction)[:, None]
+        trial = np.clip(centre + factor * (centre - worst_vertex), lower, upper)
+        tried = np.flatnonzero(is_best | ~is_accepted)
+        outcome = np.full(len(rows), np.inf)
+        if len(tried):
+            outcome[tried] = objective(rows[tried], trial[tried])
+        trial_is_better = (outcome < reflected)[:, None]
+        candidate = np.where(trial_is_better, trial, candidate)
+        outcome = np.minimum(outcome, reflected)
+
+        improved = outcome < worst
+        vertices[rows[improved], -1] = candidate[improved]
+        values[rows[improved], -1] = outcome[improved]
+        # What no point improved shrinks towards its best vertex.
+        shrinking = rows[~improved]
+        if not len(shrinking):
+            continue
+        for i in range(1, m + 1):
+            halfway = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
+            vertices[shrinking, i] = halfway
+            values[shrinking, i] = objective(shrinking, halfway)
+
+    best_vertex = values.argmin(axis=1)
+    return vertices[every_row, best_vertex], values[every_row, best_vertex]
+
+
+def _first_simplices(
+    start: Array,
+    size: Array,
+    lower: Array,
+    upper: Array,
+) -> Array:
+    """Vertices (B, m+1, m) of simplices with edges along the axes, within the box."""
+    m = start.shape[1]
+    inside = np.clip(start, lower, upper)
+    vertices = np.repeat(inside[:, None], m + 1, axis=1)
+    for i in range(m):
+        # Vertex i+1 differs from the start in entry i, inwards where outwards leaves the box.
+        entry = vertices[:, i + 1, i]
+        outward = entry + size[:, i]
+        inward = entry - size[:, i]
+        moved = np.where(outward > upper[i], inward, outward)
+        vertices[:, i + 1, i] = np.clip(moved, lower[i], upper[i])
+    return vertices
+
+
+def scan(
+    objective: Objective,
+    start: Array,
+    lower: Array,
+    upper: Array,
+    points: int,
+) -> tuple[Array, Array]:
+    """Best of a start and of a grid over the box, for B functions.
+
+    Args:
+        objective: As `nelder_mead` takes it.
+        start: Starts, (B, m).
+        lower: Lower bounds of the box, (m,).
+        upper: Upper bounds, (m,).
+        points: Number of the grid's points per variable.
+
+    Returns:
+        The best point (B, m) of each function, and its value (B,).
+    """
+    every_row = np.arange(len(start))
+    best = start.copy()
+    values = objective(every_row, start)
+    axes = [np.linspace(low, high, points) for low, high in zip(lower, upper, strict=True)]
+    for point in itertools.product(*axes):
+        candidate = np.broadcast_to(point, start.shape)
+        outcome = objective(every_row, candidate)
+        better = outcome < values
+        best[better] = np.array(point)
+        values[better] = outcome[better]
+    return best, values

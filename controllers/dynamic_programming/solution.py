@@ -1,0 +1,616 @@
+"""The optimal policy on a grid by Howard's policy iteration, with bounds and a certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from controllers.dynamic_programming.bellman import (
+    Accuracy,
+    BellmanOperator,
+    Elementwise,
+    accurate_substeps,
+)
+from controllers.dynamic_programming.grid import Grid, Indices, graded_axis
+from controllers.dynamic_programming.minimisation import nelder_mead, scan
+from controllers.errors import OptimumError
+from controllers.model import discretise, economic_cost
+from controllers.problem import PlantProblem, Problem
+from cosim.core.protocols import Array
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the solver.
+
+    `level` 0 is a first grid over all states. Each further level resolves the closed loop's support
+    (all but `tail` of the samples at each end) with `cells`·2^level cells a state; cells beyond it
+    grow by `growth` each. `nodes` and `penalty_nodes` are per disturbance; empty: 7 and 20 for the
+    first two, 2 and 4 for the third, 2 and 2 for the others. `integration_tolerance` of the sampled
+    model and `tolerance` of the distance of the gain's bounds are relative; the latter is to be met
+    within `rounds` policy iterations a grid.
+    """
+
+    level: int = 1
+    cells: int = 12
+    growth: float = 1.35
+    tail: float = 1e-7
+    nodes: tuple[int, ...] = ()
+    penalty_nodes: tuple[int, ...] = ()
+    integration_tolerance: float = 1e-6
+    tolerance: float = 1e-4
+    rounds: int = 40
+
+    def accuracy(self, plant: PlantProblem) -> Accuracy:
+        """Integrator and quadrature for a problem."""
+        # The first two disturbances move the state most.
+        count = len(plant.law.nominal)
+        others = (2,) * count
+        nodes = (7, 7, *others)[:count]
+        penalty_nodes = (20, 20, 4, *others)[:count]
+        return Accuracy(
+            substeps=accurate_substeps(plant, self.integration_tolerance),
+            nodes=self.nodes or nodes,
+            penalty_nodes=self.penalty_nodes or penalty_nodes,
+        )
+
+
+def first_grid(
+    problem: Problem,
+    operator: BellmanOperator,
+    settings: Settings,
+) -> Grid:
+    """Grid over all states within the bounds and a tenth beyond.
+
+    At the reference and at the bounds, where the optimal closed loop may live, its cells are half a
+    standard deviation of one sample's disturbance wide.
+
+    Args:
+        problem: The problem with its bounds and reference.
+        operator: The Bellman operator, which knows the disturbance's effect on a state.
+        settings: The solver's settings.
+    """
+    deviation = operator.deviation(problem.reference_state, problem.reference_action)
+    axes = []
+    for i in range(problem.n_states):
+        lower = problem.state_lower[i]
+        upper = problem.state_upper[i]
+        reference = problem.reference_state[i]
+        span = upper - lower
+        spacing = max(0.5 * deviation[i], 1e-3 * span)
+        features = []
+        for x in (lower, reference, upper):
+            features.append((x - spacing, x + spacing, spacing))
+        # Beyond the bounds, which are soft: the closed loop may violate them.
+        first = lower - 0.1 * span
+        last = upper + 0.1 * span
+        marks = sorted({first, lower, reference, upper, last})
+        axes.append(graded_axis(marks, features, settings.growth**2))
+    return Grid(tuple(axes))
+
+
+def refined(
+    operator: BellmanOperator,
+    optimum: Optimum,
+    settings: Settings,
+    level: int,
+    *,
+    smooth: bool = True,
+) -> Optimum:
+    """A policy on a grid that resolves its distribution's support with cells·2^level cells a state.
+
+    At a bound that the closed loop touches the cells are 2^-level of the standard deviation of one
+    sample's disturbance, which alone smooths the penalty's kink. The grid extends beyond the
+    support by the support's width, and at least by a twentieth of the bounds' span; without
+    disturbance it keeps its box.
+
+    Args:
+        operator: The Bellman operator.
+        optimum: The policy on a coarser grid, with its stationary distribution.
+        settings: The solver's settings.
+        level: The new grid's level.
+        smooth: Whether interpolation is cubic within the support.
+
+    Returns:
+        The policy, interpolated linearly, with its value on the new grid.
+    """
+    problem = operator.problem
+    n = problem.n_states
+    grid = optimum.grid
+
+    # The disturbance's effect on a sample, at the mean of state and action in the closed loop.
+    mass = np.maximum(optimum.distribution, 0.0)
+    points = np.column_stack([grid.points, optimum.actions])
+    mean = mass @ points / mass.sum()
+    deviation = operator.deviation(mean[:n], mean[n:])
+
+    mass_on_grid = mass.reshape(grid.shape)
+    axes = []
+    intervals = []
+    for i, axis in enumerate(grid.axes):
+        others = tuple(j for j in range(n) if j != i)
+        marginal = mass_on_grid.sum(axis=others)
+        support = _support(axis, marginal, settings.tail)
+        finer_axis = _refined_axis(operator, settings, level, i, axis, support, deviation[i])
+        axes.append(finer_axis)
+        # Beyond a bound the value has a kink wherever the return takes one more sample.
+        first = max(support[0], problem.state_lower[i])
+        last = min(support[1], problem.state_upper[i])
+        intervals.append((first, last))
+    finer = Grid(tuple(axes), tuple(intervals) if smooth else None)
+
+    states = list(finer.points.T)
+    linear = Grid(grid.axes)
+    columns = []
+    for action in optimum.actions.T:
+        interpolated = linear.interpolant(action)
+        columns.append(interpolated(states))
+    return start_policy(operator, finer, np.stack(columns, axis=1), 0.1)
+
+
+def _support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:
+    """Interval that holds all but `tail` of the mass at each end, and a cell on either side."""
+    # A cell more on either side: the mass stands at points for what is between them.
+    cumulative = np.cumsum(mass) / mass.sum()
+    ends = np.searchsorted(cumulative, (tail, 1.0 - tail))
+    first = max(ends[0] - 1, 0)
+    last = min(ends[1] + 1, len(axis) - 1)
+    return axis[first], axis[last]
+
+
+def _refined_axis(
+    operator: BellmanOperator,
+    settings: Settings,
+    level: int,
+    i: int,
+    axis: Array,
+    support: tuple[float, float],
+    deviation: float,
+) -> Array:
+    """Axis of state i on a grid of `level`; `deviation` is that of a sample's disturbance in it."""
+    problem = operator.problem
+    reference = problem.reference_state[i]
+    lower = problem.state_lower[i]
+    upper = problem.state_upper[i]
+    span = upper - lower
+    first, last = support
+    width = last - first
+
+    # Dense within the support, and about each bound that the closed loop touches.
+    refinement = 2**level
+    features = [(first, last, width / (settings.cells * refinement))]
+    marks = {reference}
+    near = max(deviation, 1e-3 * span)
+    for bound in (lower, upper):
+        if first - deviation <= bound <= last + deviation:
+            marks.add(bound)
+            features.append((bound - near, bound + near, near / refinement))
+
+    # Without disturbance a state that strays never comes into the support's mass: keep the box.
+    share = 1.0 if operator.deterministic else 0.05
+    beyond = max(width, share * span)
+    low = max(axis[0], min(first, reference) - beyond)
+    high = min(axis[-1], max(last, reference) + beyond)
+    inner_marks = [x for x in sorted(marks) if low < x < high]
+    return graded_axis([low, *inner_marks, high], features, settings.growth)
+
+
+RESTART_PROBABILITY = 1e-9
+"""Probability that a sample starts anew at the anchor: so a plant without disturbance, which may
+come to rest in several places, has one gain. It shifts J* by 1e-10 of itself."""
+
+
+class GainEstimate(NamedTuple):
+    """An estimate of J*: how it was made, its value and interval [lower, upper]."""
+
+    name: str
+    value: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """A policy on a grid with its value, in the end the optimal one.
+
+    `actions` (G, m); `W` (G,) smooth part of the value, V = penalty + W, zero at the anchor;
+    `gain` mean cost per sample, in the end J*; `distribution` (G,) the stationary one. `lower` and
+    `upper`, min and max over the grid of TW − W, enclose the optimal gain (Odoni, 1969).
+    `certificate` is that of `certify`, `step` (G, m) the last change of the actions.
+    """
+
+    grid: Grid
+    actions: Array
+    W: Array
+    gain: float
+    distribution: Array
+    accuracy: Accuracy
+    lower: float = -np.inf
+    upper: float = np.inf
+    certificate: tuple[GainEstimate, ...] = ()
+    step: Array = field(default_factory=partial(np.zeros, 0))
+
+    @property
+    def edge_mass(self) -> float:
+        """Share of samples that the closed loop spends on the edge of the grid's box."""
+        on_edge = np.zeros(self.grid.size, dtype=bool)
+        for axis, x in zip(self.grid.axes, self.grid.points.T, strict=True):
+            on_edge |= (x == axis[0]) | (x == axis[-1])
+        return float(self.distribution[on_edge].sum())
+
+
+def evaluate_policy(
+    operator: BellmanOperator,
+    grid: Grid,
+    actions: Array,
+    anchor: int,
+) -> tuple[Array, float, Array]:
+    """Value, gain and stationary distribution of a policy.
+
+    W + g = c + P W with W[anchor] = 0, by one sparse factorisation.
+
+    Args:
+        operator: The Bellman operator, which makes the chain P and the cost c.
+        grid: The grid.
+        actions: The policy, (G, m).
+        anchor: Index of the grid state whose value is zero.
+
+    Returns:
+        The smooth part W of the value (G,), the gain, and the distribution (G,).
+
+    Raises:
+        OptimumError: The chain cannot be evaluated.
+    """
+    from scipy import sparse  # noqa: PLC0415
+    from scipy.sparse.linalg import splu  # noqa: PLC0415
+
+    # [I − P  1; e_anchorᵀ  0] (W, g) = (c, 0).
+    transition, cost = operator.chain(actions, grid)
+    size = grid.size
+    unit = sparse.csr_array(([1.0], ([0], [anchor])), shape=(1, size))
+    flow = sparse.eye_array(size) - (1.0 - RESTART_PROBABILITY) * transition
+    ones = np.ones((size, 1))
+    bordered = sparse.block_array([[flow, ones], [unit, None]], format="csc")
+    try:
+        factors = splu(bordered)
+    except RuntimeError as error:
+        raise OptimumError(f"policy evaluation on a grid of {size} states: {error}") from error
+    solution = factors.solve(np.append(cost, 0.0))
+    W = solution[:size]
+    gain = float(solution[size])
+
+    # The transposed system's last row makes the multipliers a distribution: they sum to 1.
+    sum_is_one = np.append(np.zeros(size), 1.0)
+    stationary = factors.solve(sum_is_one, trans="T")
+    distribution = stationary[:size]
+    return W, gain, distribution
+
+
+def start_policy(
+    operator: BellmanOperator,
+    grid: Grid,
+    actions: Array,
+    share: float = 1.0,
+) -> Optimum:
+    """Evaluate a first policy; its `step` is a tenth of the action box times `share`.
+
+    Args:
+        operator: The Bellman operator.
+        grid: The grid.
+        actions: The policy, (G, m).
+        share: How far the next improvement looks, as a share of a tenth of the action box.
+    """
+    problem = operator.problem
+    anchor = grid.nearest(problem.reference_state)
+    W, gain, distribution = evaluate_policy(operator, grid, actions, anchor)
+    tenth = 0.1 * (problem.action_upper - problem.action_lower)
+    return Optimum(
+        grid=grid,
+        actions=actions,
+        W=W,
+        gain=gain,
+        distribution=distribution,
+        accuracy=operator.accuracy,
+        step=share * np.tile(tenth, (grid.size, 1)),
+    )
+
+
+def improve_policy(
+    operator: BellmanOperator,
+    iterate: Optimum,
+    scan_points: int,
+) -> Optimum:
+    """Improve the policy once and bound the remaining gain.
+
+    Each state has a local search from its present action or from a better one of a scan over the
+    box; `lower` is a bound if that finds the global minimum.
+
+    Args:
+        operator: The Bellman operator.
+        iterate: The present policy with its value.
+        scan_points: Number of actions per dimension that the scan tries.
+
+    Returns:
+        The improved actions with the value of the former ones and its bounds.
+    """
+    grid = iterate.grid
+    lower = operator.problem.action_lower
+    upper = operator.problem.action_upper
+
+    def objective(rows: Indices, actions: Array) -> Array:
+        return operator.values(grid.points[rows], actions, grid, iterate.W)
+
+    start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
+    # A simplex twice as large as the last change of an action finds the next one.
+    width = upper - lower
+    wanted = 2.0 * np.abs(iterate.step)
+    size = np.clip(wanted, 2e-3 * width, 0.1 * width)
+    actions, values = nelder_mead(
+        objective,
+        start,
+        size,
+        lower,
+        upper,
+        iterations=30,
+        precision=1e-8 * abs(iterate.gain),
+    )
+    # Odoni (1969): the least and the largest of TW − W enclose the optimal gain.
+    residual = values - iterate.W
+    return replace(
+        iterate,
+        actions=actions,
+        step=actions - iterate.actions,
+        lower=float(residual.min()),
+        upper=float(residual.max()),
+    )
+
+
+RoundProgress = Callable[[int, int, Optimum], None]
+"""Called with the grid's level, the round on it and its result."""
+
+
+CERTIFICATE_TOLERANCE = 5e-4
+"""Relative distance within which the estimates of a certificate must agree."""
+REQUIRED_ESTIMATES = ("solution", "refinement", "simulation")
+SEARCH = "policy search"
+
+
+def objection(certificate: Sequence[GainEstimate]) -> str | None:
+    """Why a certified solution may not be called J*, or None.
+
+    All estimates but that of a policy search must agree within `CERTIFICATE_TOLERANCE`.
+    """
+    estimates = {estimate.name: estimate for estimate in certificate}
+    missing = [name for name in REQUIRED_ESTIMATES if name not in estimates]
+    if missing:
+        return f"not made: {', '.join(missing)}"
+    # A search has a bound from above alone: what it finds may be dearer, not cheaper.
+    search = estimates.pop(SEARCH, None)
+    percent = 100 * CERTIFICATE_TOLERANCE
+    # The others have intervals on both sides: they must agree with each other.
+    values = [estimate.value for estimate in estimates.values()]
+    least = min(values)
+    spread = (max(values) - least) / abs(least)
+    if spread > CERTIFICATE_TOLERANCE:
+        names = ", ".join(estimates)
+        return f"{names} are {100 * spread:.3f} % apart, more than {percent:g} %"
+    allowed = CERTIFICATE_TOLERANCE * abs(values[0])
+    for estimate in estimates.values():
+        if estimate.upper - estimate.lower > 2 * allowed:
+            return f"the interval of the {estimate.name} is wider than {2 * allowed:.3g}"
+    if search is None:
+        return None
+    if search.upper < estimates["refinement"].value - allowed:
+        return (
+            f"a policy search found {search.value:.2f}, more than {percent:g} % "
+            "below the refinement"
+        )
+    return None
+
+
+def solve(
+    plant: PlantProblem,
+    settings: Settings | None = None,
+    *,
+    workers: int = 2,
+    progress: RoundProgress | None = None,
+) -> Optimum:
+    """Solve for the optimal policy of the stochastic plant by Howard's policy iteration.
+
+    Args:
+        plant: The plant's model with its law and parameters.
+        settings: The solver's settings; the default ones where they are None.
+        workers: Threads that share the states; results do not depend on their number.
+        progress: Called after each round.
+
+    Raises:
+        OptimumError: The bounds do not close to 1 % of the gain, or the closed loop leaves the
+            grid's box in more than one of 10⁴ samples.
+    """
+    problem = plant.problem
+    settings = settings or Settings()
+    accuracy = settings.accuracy(plant)
+    draft = BellmanOperator(plant, accuracy.draft(), workers=workers)
+    operator = BellmanOperator(plant, accuracy, workers=workers)
+    run = partial(_iterate, settings=settings, progress=progress)
+    approach = partial(run, draft, scan_points=5, start_only=True)
+
+    # From the constant policy u_s to a first policy on the coarse grid.
+    grid = first_grid(problem, draft, settings)
+    constant = np.tile(problem.reference_action, (grid.size, 1))
+    iterate = start_policy(draft, grid, constant)
+    iterate = approach(iterate, 0)
+
+    # Linear interpolation is monotone, so it converges from any start; it smears the closed loop
+    # over its cells, so the support is known only once these are fine.
+    if settings.level:
+        iterate = refined(draft, iterate, settings, 1, smooth=False)
+        iterate = approach(iterate, 1)
+    for level in range(1, settings.level + 1):
+        iterate = refined(draft, iterate, settings, level)
+        iterate = approach(iterate, level)
+
+    # One round that looks for better actions in the whole action box.
+    iterate = run(draft, iterate, settings.level, scan_points=9, rounds=1)
+    return _accepted(run(operator, iterate, settings.level))
+
+
+def _iterate(
+    operator: BellmanOperator,
+    iterate: Optimum,
+    level: int,
+    settings: Settings,
+    progress: RoundProgress | None,
+    *,
+    scan_points: int = 3,
+    rounds: int | None = None,
+    start_only: bool = False,
+) -> Optimum:
+    """Improve and evaluate until the bounds meet or, where `start_only`, the gain rests."""
+    grid = iterate.grid
+    anchor = grid.nearest(operator.problem.reference_state)
+    for k in range(rounds or settings.rounds):
+        last_gain = iterate.gain
+        better = improve_policy(operator, iterate, scan_points)
+        W, gain, distribution = evaluate_policy(operator, grid, better.actions, anchor)
+        iterate = replace(
+            better,
+            W=W,
+            gain=gain,
+            distribution=distribution,
+            accuracy=operator.accuracy,
+        )
+        if progress is not None:
+            progress(level, k, iterate)
+        # A start is good enough once the gain rests; a solution has bounds that meet.
+        if start_only:
+            distance = last_gain - gain
+            allowed = 1e-4 * abs(gain)
+        else:
+            distance = iterate.upper - iterate.lower
+            allowed = settings.tolerance * abs(gain)
+        if distance <= allowed:
+            break
+    return iterate
+
+
+def _accepted(optimum: Optimum) -> Optimum:
+    """The optimum with bounds about its gain; raises OptimumError where it is none (`solve`)."""
+    gain = optimum.gain
+    distance = optimum.upper - optimum.lower
+    if distance > 0.01 * abs(gain):
+        raise OptimumError(
+            f"policy iteration: the bounds of the gain, {optimum.lower:.6g} and "
+            f"{optimum.upper:.6g}, are more than 1 % apart; allow more rounds or another grid"
+        )
+    accepted = replace(
+        optimum,
+        distribution=np.maximum(optimum.distribution, 0.0),
+        lower=min(optimum.lower, gain),
+        upper=max(optimum.upper, gain),
+    )
+    if accepted.edge_mass > 1e-4:
+        raise OptimumError(
+            f"the optimal closed loop is on the edge of the grid's box in "
+            f"{100 * accepted.edge_mass:.3g} % of the samples; widen the state bounds"
+        )
+    return accepted
+
+
+def simulate_policy(
+    plant: PlantProblem,
+    optimum: Optimum,
+    *,
+    paths: int = 2000,
+    steps: int = 5000,
+) -> tuple[float, float]:
+    """Mean cost per sample of a solution's policy on the plant's model.
+
+    The policy is interpolated as in `OptimalPolicy`. Each of the independent paths starts in a
+    state drawn from the stationary distribution; its first 300 samples are left out.
+
+    Args:
+        plant: its model and the law of its disturbances.
+        optimum: the solution.
+        paths: how many, all at once.
+        steps: samples of each path that count.
+
+    Returns:
+        The mean, and half its 95 % interval.
+    """
+    burn_in = 300
+    rng = np.random.default_rng(0)
+    problem = plant.problem
+    model = problem.model
+    parameters = plant.parameters
+    step = Elementwise(discretise(model, problem.sampling_time, optimum.accuracy.substeps))
+    stage_cost = Elementwise(economic_cost(model))
+    # Without the smooth parts: linear, as the policy is applied.
+    grid = Grid(optimum.grid.axes)
+    policy = [grid.interpolant(column) for column in optimum.actions.T]
+
+    # The burn-in then only has to forget the grid.
+    probabilities = optimum.distribution / optimum.distribution.sum()
+    start = rng.choice(grid.size, paths, p=probabilities)
+    # An array (paths,) for each state, action and disturbance.
+    x = list(grid.points[start].T)
+    total = np.zeros(paths)
+    for k in range(burn_in + steps):
+        u = [action(x) for action in policy]
+        disturbances = plant.law.draw(rng, paths)
+        d = list(disturbances.T)
+        if k >= burn_in:
+            (cost,) = stage_cost(x, u, d, parameters)
+            total += cost
+            total += problem.penalty.along(np.stack(x, axis=1))
+        x_next = step(x, u, d, parameters)
+        # A state that depends on no other may be one number.
+        x = [np.broadcast_to(state, paths) for state in x_next]
+
+    means = total / steps
+    half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
+    return float(means.mean()), float(half_width)
+
+
+def certify(
+    plant: PlantProblem,
+    settings: Settings,
+    optimum: Optimum,
+    *,
+    paths: int = 2000,
+    steps: int = 5000,
+    progress: RoundProgress | None = None,
+) -> Optimum:
+    """The solution on the grid of the next level, started from a solution, with a certificate.
+
+    Its estimates: `solution`, the gain and its bounds on the given grid; `refinement`, those on the
+    next level; `simulation`, the mean cost of the refined policy on the plant's model, 95 %; where
+    it is added, `policy search`, the best θ that a search found, on the same noise.
+
+    Args:
+        plant: The plant's model with its law and parameters.
+        settings: The settings with which the solution was made.
+        optimum: The solution.
+        paths: Paths of the simulation.
+        steps: Samples of each path.
+        progress: Called after each round.
+
+    Raises:
+        OptimumError: As `solve` raises it.
+    """
+    operator = BellmanOperator(plant, optimum.accuracy, workers=2)
+    level = settings.level + 1
+    # At full accuracy from the start, since the solution is close by.
+    start = refined(operator, optimum, settings, level)
+    iterate = _iterate(operator, start, level, settings, progress)
+    refinement = _accepted(iterate)
+    mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
+    estimates = []
+    for name, solution in (("solution", optimum), ("refinement", refinement)):
+        estimates.append(GainEstimate(name, solution.gain, solution.lower, solution.upper))
+    estimates.append(GainEstimate("simulation", mean, mean - half_width, mean + half_width))
+    return replace(refinement, certificate=tuple(estimates))

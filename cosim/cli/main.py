@@ -29,6 +29,7 @@ from cosim.cli import (
     train,
     view,
 )
+from cosim.cli.output import descriptions
 from cosim.core.errors import CosimError, CosimWarning
 from cosim.core.files import protect
 from cosim.core.processes import Interrupted, Terminated, command_process, unwound
@@ -48,12 +49,12 @@ OPTIONS_OF_PANELS = {
 PANELS = {name: panel for panel, names in OPTIONS_OF_PANELS.items() for name in names}
 
 
-def _documentation(command: object) -> tuple[str, dict[str, str]]:
-    """A command's text, with paragraphs as wide as the terminal, and those of its options."""
-    text, _, options = (getdoc(command) or "").partition("\n\nArgs:\n")
-    paragraphs = (paragraph.replace("\n", " ") for paragraph in text.split("\n\n"))
-    described = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", options, re.DOTALL | re.MULTILINE)
-    return "\n\n".join(paragraphs), {name: " ".join(words.split()) for name, words in described}
+def _help_text(command: object) -> str:
+    """What a command does: its docstring up to the arguments, a paragraph a line."""
+    text = (getdoc(command) or "").partition("\n\nArgs:\n")[0]
+    # A terminal breaks the lines where it ends.
+    paragraphs = [paragraph.replace("\n", " ") for paragraph in text.split("\n\n")]
+    return "\n\n".join(paragraphs)
 
 
 class _Commands(TyperGroup):
@@ -78,7 +79,7 @@ class _Commands(TyperGroup):
             commands: list[Any] = [*self.commands.values()]
             for command in commands:
                 commands += getattr(command, "commands", {}).values()
-                described = _documentation(command.callback)[1]
+                described = descriptions(command.callback, "Args")
                 for option in command.params:
                     option.rich_help_panel = PANELS.get(option.name, option.rich_help_panel)
                     option.help = described.get(option.name, option.help)
@@ -132,8 +133,8 @@ for panel, function, example in (
     (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
     (RUN_PANEL, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
-    text, epilog = _documentation(function)[0], f"Example: cosim {example}"
-    app.command(rich_help_panel=panel, help=text, epilog=epilog)(function)
+    epilog = f"Example: cosim {example}"
+    app.command(rich_help_panel=panel, help=_help_text(function), epilog=epilog)(function)
 for panel, group, name, *examples in (
     (BUILD, scenario.scenario_app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
     (
@@ -150,7 +151,8 @@ for panel, group, name, *examples in (
     texts = [f"Example: cosim {name} {example}" for example in examples]
     app.add_typer(group, name=name, rich_help_panel=panel, epilog=texts[0])
     for command, text in zip(group.registered_commands, texts, strict=True):
-        command.help, command.epilog = _documentation(command.callback)[0], text
+        command.help = _help_text(command.callback)
+        command.epilog = text
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70

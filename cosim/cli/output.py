@@ -9,6 +9,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +26,18 @@ MOST = 100_000_000
 def count(*names: str, text: str | None = None) -> Any:
     """An option that is a number of samples."""
     return typer.Option(*names, min=1, max=MOST, help=text)
+
+
+def descriptions(documented: object, section: str) -> dict[str, str]:
+    """What a docstring says of each name in one of its sections, on one line each.
+
+    Args:
+        documented: what has the docstring.
+        section: heading of the section, `Args` or `Attributes`.
+    """
+    entries = (getdoc(documented) or "").partition(f"\n\n{section}:\n")[2]
+    found = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", entries, re.DOTALL | re.MULTILINE)
+    return {name: " ".join(words.split()) for name, words in found}
 
 
 ScenarioOption = Annotated[

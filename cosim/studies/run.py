@@ -15,7 +15,7 @@ import json
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +26,7 @@ from cosim.core.files import read_json, temporary_folder, write_atomically
 from cosim.core.modules import UNKNOWN
 from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario
+from cosim.core.training_options import TrainingOptions
 from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.identity import changed, file_hash
 from cosim.measurement import Factory, Measured, MeasureItem, Noise
@@ -114,50 +115,32 @@ class TrainingJob:
     Attributes:
         algorithm: a registered name, or `module:Class`.
         samples: plant samples.
-        seed: of noise and exploration.
-        nmpc: the NMPC that carries θ, `rti` or `converged`.
-        start: where θ starts: a name, or a θ file.
-        theta: text of that θ file; None for a start with a name.
-        settings: the algorithm's hyperparameters by name.
-        options: further options of the training loop by name.
+        options: seed, start and all else that is chosen of it.
+        theta: text of the θ file where θ starts; None for a start with a name.
+        settings: the algorithm's hyperparameters by name, as its configuration takes them.
         marks: in operation, the samples after which θ is evaluated; else empty.
     """
 
     algorithm: str
     samples: int
-    seed: int
-    nmpc: str
-    start: str
+    options: TrainingOptions
     theta: str | None
     settings: Mapping[str, object]
-    options: Mapping[str, int | float | None]
     marks: tuple[int, ...] = ()
 
     def make_run(self, scenario: Scenario) -> TrainingRun:
         """The training on a scenario; raises what is wrong with it."""
         from learning.training_run import make_run  # noqa: PLC0415
 
-        # What an option may be is checked there.
-        options: dict[str, Any] = dict(self.options)
-        return make_run(
-            self.algorithm,
-            scenario,
-            self.samples,
-            self.settings,
-            seed=self.seed,
-            start=self.start,
-            controller=self.nmpc,
-            **options,
-        )
+        return make_run(self.algorithm, scenario, self.samples, self.settings, self.options)
 
     def facts(self, start: str) -> dict[str, Any]:
         """What the training's result depends on, with the start as the study's file names it."""
-        named = {"seed": self.seed, "controller": self.nmpc, "start": start}
         return {
             "algorithm": self.algorithm,
             "samples": self.samples,
             "settings": dict(self.settings),
-            "options": named | dict(self.options),
+            "options": asdict(replace(self.options, start=start)),
         }
 
 
@@ -215,7 +198,7 @@ class Run:
     def source(self, parameters: str) -> ControllerSource | Factory:
         """The controller; of a training the NMPC of the θ that a TOML text holds."""
         if self.training is not None:
-            return ControllerSource(PARAMETERS, parameters, self.training.nmpc)
+            return ControllerSource(PARAMETERS, parameters, self.training.options.controller)
         assert self.controller is not None
         return self.controller
 
@@ -286,7 +269,8 @@ class TrainItem(Item[Trained]):
             if training.theta is not None:
                 start = folder / "start.toml"
                 start.write_text(training.theta, "utf-8")
-                training = replace(training, start=str(start))
+                options = replace(training.options, start=str(start))
+                training = replace(training, options=options)
             run = training.make_run(self.conditions.scenario)
             if training.marks:
                 trained = _train_in_operation(run, training.marks)

@@ -8,6 +8,7 @@ from scipy import stats
 from controllers.factories import nmpc
 from cosim import FmuPlant, study
 from cosim.core.simulation import spawn_seeds
+from cosim.core.training_options import TrainingOptions
 from cosim.studies.operation import (
     OPERATION_METRICS,
     SHIFT,
@@ -214,7 +215,7 @@ def test_the_first_change_counts_the_samples_before_it_and_their_cost_is_the_sta
 def start_in_closed_loop(samples, seed):
     """Costs of θ as it starts, and whether a bound is violated, in a loop of this test's own."""
     scenario = toy_scenario()
-    run = make_run("fixed", scenario, samples, seed=seed)
+    run = make_run("fixed", scenario, samples, options=TrainingOptions(seed=seed))
     controller = nmpc(scenario, run.starting_parameters(), "rti")
     costs, violating = [], []
     with FmuPlant(scenario) as plant:

@@ -28,6 +28,7 @@ from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
 from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Study, StudyPlan, plan
+from cosim.studies.ranks import shared_ranks
 from cosim.studies.report import NEAR, PAPER, REPORT_COLUMNS, SHORT_COLUMNS
 from cosim.studies.run import (
     GREEDY,
@@ -66,6 +67,8 @@ MEASURED_COLUMNS = {
 """Columns of the tables that runs give; `RAW_TABLES` are those of every study."""
 CASE_FIELDS = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
 """What study.json says of a case as it is."""
+WEEK = 7 * 86400.0
+"""Seconds of a week."""
 MOST_LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -266,9 +269,11 @@ class StudyResults(Shown):
                 if len(self.indicator(case, scenario)):
                     of_scenario.append(self._summary_row(case, scenario))
             of_scenario.sort(key=lambda row: float(row["J_median"]))
-            self._rank(scenario, of_scenario)
+            ranks = self._ranks(scenario, [row["case"] for row in of_scenario])
+            for row in of_scenario:
+                row["rank"] = ranks[row["case"]]
             rows += of_scenario
-        return pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
+        return pd.DataFrame(rows, columns=SUMMARY_COLUMNS).astype({"rank": "Int64"})
 
     def _summary_row(self, case: str, scenario: str) -> dict[str, Any]:
         """A case's row of the summary, but for its rank."""
@@ -337,24 +342,52 @@ class StudyResults(Shown):
         pair = np.broadcast_arrays(cost, other_cost)
         return pair[0], pair[1]
 
-    def _rank(self, scenario: str, rows: list[dict[str, Any]]) -> None:
-        """Set the ranks of rows, the lowest median J first.
+    def _ranks(self, scenario: str, cases: Sequence[str]) -> dict[str, int | None]:
+        """Ranks of cases on a scenario, given in the order of their median J."""
 
-        Those that do not differ from the first of their group share its rank.
-        """
-        first = 0
-        for place, row in enumerate(rows):
-            case, leader = row["case"], rows[first]["case"]
+        def is_worse(case: str, leader: str) -> bool:
             cost, leader_cost = self._pairs(case, leader, scenario)
+            # Without a training seed in common nothing is known.
+            if not len(cost):
+                return False
             best = self.reference("optimum", scenario)
             if best is None:
                 best = leader_cost.mean(axis=0)
-            spread_known = not (self._single(case, scenario) or self._single(leader, scenario))
-            if spread_known and len(cost):  # they have a training seed in common
-                interval = paired_difference(cost, leader_cost, best)[1]
-                if interval is not None and interval[0] > 0:
-                    first = place
-            row["rank"] = first + 1
+            interval = paired_difference(cost, leader_cost, best)[1]
+            return interval is not None and interval[0] > 0
+
+        trained_once = [case for case in cases if self._single(case, scenario)]
+        return shared_ranks(cases, trained_once, is_worse)
+
+    def violations_per_week(self, case: str, scenario: str) -> Estimate:
+        """Samples of a week that violate a bound: the median over a case's runs of their mean.
+
+        Args:
+            case: name of the case.
+            scenario: name of the scenario.
+
+        Returns:
+            The number and its interval over training seeds and noise, or over the noise alone of a
+            single run; NaN where the study does not say its sampling time.
+        """
+        share = self.indicator(case, scenario, "violating_share")
+        sampling_time = self._sampling_time(scenario)
+        if sampling_time is None or not share.size:
+            return Estimate(np.nan)
+        per_week = share * WEEK / sampling_time
+        ones = np.ones(per_week.shape[1])
+        interval = two_way(per_week, ones, np.zeros_like(per_week))
+        return Estimate(float(np.median(per_week.mean(axis=1))), interval)
+
+    def _sampling_time(self, scenario: str) -> float | None:
+        """Sampling time in s; None in studies that an earlier version stored."""
+        times: Mapping[str, float] = self.about.get("sampling_times", {})
+        if scenario in times:
+            return times[scenario]
+        in_operation = self.about.get("operation") or {}
+        if scenario in in_operation:
+            return float(in_operation[scenario]["sampling_time"])
+        return None
 
     def regrets(self, case: str, scenario: str) -> Array:
         """Regret (R,) of each run; infinite if J is not finite, NaN if J* is unknown."""
@@ -406,13 +439,34 @@ class StudyResults(Shown):
             StudyError: there is no such column.
         """
         if columns is None:
-            paired = any(case.get("against") for case in self.cases.values())
-            columns = list(REPORT_COLUMNS) if paired else list(REPORT_COLUMNS)[:-3]
+            columns = list(REPORT_COLUMNS)
+            if not any(case.get("against") for case in self.cases.values()):
+                columns = columns[:-3]
+            if self._sampling_time(scenario) is None:
+                columns.remove("week")
         for name in columns:
             if name not in REPORT_COLUMNS:
                 raise StudyError(f"a table has no column '{name}'{instead(name, REPORT_COLUMNS)}")
         rows = self.summary[self.summary.scenario == scenario].to_dict("records")
+        for row in rows:
+            row.update(self._further_intervals(row))
         return report.texts(rows, dict(REPORT_COLUMNS[name] for name in columns))
+
+    def _further_intervals(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """What a printed row shows beside its columns of the summary."""
+        case = row["case"]
+        scenario = row["scenario"]
+        # Of one training the interval is over the noise alone.
+        kind = "regret_median" if self._single(case, scenario) else "regret_wide"
+        runs = self.runs_of(case, scenario)
+        worst = runs.iloc[int(np.argmax(runs.J))]
+        return {
+            "regret_shown_low": row[f"{kind}_low"],
+            "regret_shown_high": row[f"{kind}_high"],
+            "regret_worst_low": worst.regret_low,
+            "regret_worst_high": worst.regret_high,
+            **_columns("violations_week", self.violations_per_week(case, scenario)),
+        }
 
     def table(self, scenario: str | None = None) -> str:
         """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
@@ -671,10 +725,14 @@ class StudyResults(Shown):
         rows = self.evaluation[self.evaluation.scenario == scenario]
         if rows.empty:
             return "No run is finished."
+        note = (
+            f"Table and regret: {rows.seed.nunique()} noise seeds × {rows.steps.iloc[0]} samples."
+        )
+        if scenario not in self.about["curves"]:
+            return note
         seeds, steps = self.about["curves"][scenario]
         return (
-            f"Table and regret: {rows.seed.nunique()} noise seeds × {rows.steps.iloc[0]} "
-            f"samples. Learning curves: {seeds} other seeds × {steps} samples. Regrets of a case "
+            f"{note} Learning curves: {seeds} other seeds × {steps} samples. Regrets of a case "
             "differ between the two."
         )
 
@@ -796,7 +854,7 @@ def document(plan: StudyPlan) -> dict[str, Any]:
         about_case["against"] = definition.counterpart(case)
         cases.append(about_case)
     curves = {}
-    for name in scenarios:
+    for name in scenarios if definition.has_curves else ():
         noise = definition.held_out(name)
         curves[name] = [len(noise.seeds), noise.steps]
     about = {
@@ -810,6 +868,9 @@ def document(plan: StudyPlan) -> dict[str, Any]:
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.named(NAIVE)),
         "curves": curves,
+        "sampling_times": {
+            name: scenario.sampling_time for name, scenario in definition.scenarios.items()
+        },
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
         "made_with": dict(plan.provenance) | {"commit": report.commit()},

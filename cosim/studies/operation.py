@@ -195,8 +195,10 @@ def worst_window(cost: Array) -> float:
     if not np.isfinite(cost).all():
         return float("inf")
     width = min(WINDOW, len(cost))
-    total = np.concatenate([[0.0], np.cumsum(cost)])
-    return float((total[width:] - total[:-width]).max() / width)
+    # The sum over a window is a difference of sums from the start, which begin with 0.
+    sums = np.append(0.0, np.cumsum(cost))
+    window_sums = sums[width:] - sums[:-width]
+    return float(window_sums.max() / width)
 
 
 class ShiftComparison(NamedTuple):
@@ -276,26 +278,49 @@ def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> 
         optimum: name of the case whose J is J*; another name if there is none.
     """
     costs = _greedy_costs(greedy)
-    best = {mark: table.to_numpy()[0] for mark, table in costs.pop(optimum, {}).items()}
+    optimal_costs = costs.pop(optimum, None)
+    # A run's noise is that of its training seed, for as many samples.
     same_noise = ["training_seed", "samples"]
-    best_run = runs[runs.case == optimum].set_index(same_noise).J
-    if not best:
-        for mark in runs.samples.unique().tolist():
-            means = [by[mark].to_numpy().mean(axis=0) for by in costs.values() if mark in by]
-            best[mark] = min(means, key=np.mean)
+    if optimal_costs is not None:
+        best = {mark: table.to_numpy()[0] for mark, table in optimal_costs.items()}
+        best_run = runs[runs.case == optimum].set_index(same_noise).J
+    else:
+        best = _best_costs(costs, runs.samples.unique().tolist())
         best_run = runs.groupby(same_noise).J.min()
     run_key = ["case", *same_noise]
-    greedy_J = greedy.groupby(run_key).J.mean().rename("greedy_J").reset_index()
+    greedy_mean = greedy.groupby(run_key).J.mean()
+    greedy_J = greedy_mean.rename("greedy_J").reset_index()
     rows = runs[runs.case != optimum]
     rows = rows.merge(best_run.rename("optimal_J"), on=same_noise, how="left")
     rows = rows.merge(greedy_J, on=run_key, how="left")
-    best_mean = rows.samples.map({mark: float(cost.mean()) for mark, cost in best.items()})
-    rows["regret"] = regrets(rows.greedy_J.to_numpy(), best_mean.to_numpy())
+    # The greedy policies of a mark share its noise, the whole runs of a training seed theirs.
+    optimal_greedy = {mark: float(cost.mean()) for mark, cost in best.items()}
+    optimal_greedy_J = rows.samples.map(optimal_greedy).to_numpy()
+    rows["regret"] = regrets(rows.greedy_J.to_numpy(), optimal_greedy_J)
     optimal_J = rows.optimal_J.to_numpy()
     rows["life_regret"] = regrets(rows.J.to_numpy(), optimal_J)
     rows["dearest"] = regrets(rows.dearest.to_numpy(), optimal_J)
     rows["excess"] = relative(rows.excess.to_numpy(), optimal_J)
     return OperationResult(costs, best, rows)
+
+
+def _best_costs(
+    costs: Mapping[str, Mapping[int, pd.DataFrame]], marks: Sequence[int]
+) -> dict[int, Array]:
+    """Greedy J (S,) of the best case at each mark, its mean over the training seeds.
+
+    Args:
+        costs: greedy J of each case by mark, (R, S).
+        marks: samples of operation.
+    """
+    best = {}
+    for mark in marks:
+        means = []
+        for tables in costs.values():
+            if mark in tables:
+                means.append(tables[mark].to_numpy().mean(axis=0))
+        best[mark] = min(means, key=np.mean)
+    return best
 
 
 def _greedy_costs(greedy: pd.DataFrame) -> dict[str, dict[int, pd.DataFrame]]:

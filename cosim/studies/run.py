@@ -83,9 +83,11 @@ def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = 
     import pandas as pd  # noqa: PLC0415
 
     try:
+        # As texts: an empty cell alone is missing, not a case called NA.
         texts = pd.read_csv(path, dtype="string", keep_default_na=False, na_values=[""])
-        wanted = dict.fromkeys([*(columns or texts), *needed])
-        return typed(texts[list(wanted)])
+        chosen = columns or list(texts)
+        further = [name for name in needed if name not in chosen]
+        return typed(texts[[*chosen, *further]])
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise StudyError(f"'{path}' is missing or damaged: {error}") from None
 
@@ -554,13 +556,16 @@ class RunStore:
 
     def seal(self) -> None:
         """Write the hashes of a finished run's files to run.json."""
-        trained = self.run.training is None or bool(self.status)
-        self.complete = trained and not any(self.missing(file) for file in self.run.noise)
-        if self.complete:
-            self.flush()
-            files = {path.name: file_hash(path) for path in self._files() if path.name != TIMING}
-            if self.about.get("files") != files:
-                self._note(files=files)
+        is_trained = self.run.training is None or bool(self.status)
+        lacks_noise = any(self.missing(file) for file in self.run.noise)
+        self.complete = is_trained and not lacks_noise
+        if not self.complete:
+            return
+        self.flush()
+        # Times differ from run to run: they are no result.
+        hashes = {path.name: file_hash(path) for path in self._files() if path.name != TIMING}
+        if self.about.get("files") != hashes:
+            self._note(files=hashes)
 
     def _unseal(self) -> None:
         """Remove the hashes before more is written, but those of the training's own files."""

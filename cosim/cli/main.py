@@ -64,26 +64,38 @@ class _Commands(TyperGroup):
         """Refuse empty words: as a path, one would mean the working directory; protect inputs."""
         inputs: list[str] = []
         for before, word in pairwise(["", *args]):
+            # A value stands behind its option, or with it: `--out DIR`, `--out=DIR`.
             name, equals, value = word.partition("=")
-            if not word or (name.startswith("--") and equals and not value):
-                name = name or (before if before.startswith("-") else "")
+            is_empty_value = name.startswith("--") and bool(equals) and not value
+            if not word and before.startswith("-"):
+                name = before
+            if not word or is_empty_value:
                 what = f"the value of '{name}'" if name else "an argument"
                 raise CosimError(f"{what} is empty: give one, or leave it out")
-            if not {before, name} & set(OUTPUT_OPTIONS):
+            is_output = before in OUTPUT_OPTIONS or name in OUTPUT_OPTIONS
+            if not is_output:
+                # Any word may name a file that is read, alone or in a list of names.
                 inputs += [word, *re.split("[,=]", word)]
         protect(inputs)
-        if ctx.resilient_parsing or {"-h", "--help"} & {*args}:  # completion says what help says
-            import typer.rich_utils
-
-            typer.rich_utils.RANGE_STRING = ""  # [1<=x<=100000000] takes a narrow terminal's room
-            commands: list[Any] = [*self.commands.values()]
-            for command in commands:
-                commands += getattr(command, "commands", {}).values()
-                described = descriptions(command.callback, "Args")
-                for option in command.params:
-                    option.rich_help_panel = PANELS.get(option.name, option.rich_help_panel)
-                    option.help = described.get(option.name, option.help)
+        # Completion says what the help says.
+        if ctx.resilient_parsing or "-h" in args or "--help" in args:
+            self._describe_options()
         return super().parse_args(ctx, args)
+
+    def _describe_options(self) -> None:
+        """Give each option of each command its text and its panel: only the help shows them."""
+        import typer.rich_utils
+
+        # [1<=x<=100000000] takes a narrow terminal's room.
+        typer.rich_utils.RANGE_STRING = ""
+        commands: list[Any] = [*self.commands.values()]
+        # A group's own commands are put behind it, and come in their turn.
+        for command in commands:
+            commands += getattr(command, "commands", {}).values()
+            described = descriptions(command.callback, "Args")
+            for option in command.params:
+                option.rich_help_panel = PANELS.get(option.name, option.rich_help_panel)
+                option.help = described.get(option.name, option.help)
 
     def invoke(self, ctx: Any) -> Any:
         """Let Ctrl-C through, which Typer would end without a word."""

@@ -67,8 +67,6 @@ MEASURED_COLUMNS = {
 """Columns of the tables that runs give; `RAW_TABLES` are those of every study."""
 CASE_FIELDS = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
 """What study.json says of a case as it is."""
-WEEK = 7 * 86400.0
-"""Seconds of a week."""
 MOST_LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -377,7 +375,7 @@ class StudyResults(Shown):
         sampling_time = self._sampling_time(scenario)
         if sampling_time is None or not share.size:
             return Estimate(np.nan)
-        per_week = share * WEEK / sampling_time
+        per_week = share * operation.WEEK / sampling_time
         ones = np.ones(per_week.shape[1])
         interval = two_way(per_week, ones, np.zeros_like(per_week))
         return Estimate(float(np.median(per_week.mean(axis=1))), interval)

@@ -1,7 +1,7 @@
 import numpy as np
 import pandas as pd
 
-from cosim import study
+from cosim import Study, study
 from cosim.studies.operation import (
     OPERATION_METRICS,
     SHIFT,
@@ -62,6 +62,15 @@ def test_in_operation_theta_is_evaluated_on_the_noise_of_the_comparison(tmp_path
     assert list(at_the_end.J) == list(evaluated.J)
     assert list(greedy[greedy.samples == 60].J) != list(evaluated.J)
     assert "Learning curves" not in results.report().read_text()
+
+
+def test_with_a_table_curves_theta_in_operation_meets_its_noise_after_the_same_burn_in():
+    document = {"schema": 1, "name": "one", "scenarios": ["paper"], "operation": {"hours": [1]}}
+    document["evaluation"] = {"first_seed": 50, "seeds": 2, "steps": 20, "burn_in": 5}
+    document["case"] = [{"controller": "naive"}]
+    document["curves"] = {"seeds": 3, "steps": 10}
+    noise = Study.from_dict(document).noise_at_marks("paper")
+    assert (len(noise.seeds), noise.steps, noise.burn_in) == (3, 10, 5)
 
 
 def test_cases_with_other_training_seeds_are_compared_on_those_that_both_have():

@@ -23,6 +23,7 @@ from cosim.core.protocols import Controller
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import simulate
 from cosim.core.statistics import regrets
+from cosim.core.training_options import TrainingOptions
 from cosim.plant import FmuPlant
 from learning.model_based import ModelBased
 from learning.training_run import TrainingRun, begin_training, make_run
@@ -69,9 +70,9 @@ def asked(
     parser.add_argument("--parameters", nargs="*", default=["all"], help="of the model, in θ")
     chosen = parser.parse_args()
     settings = {"model_parameters": chosen.parameters, **parts[chosen.without]}
-    options = {"seed": chosen.seed, "start": chosen.start}
+    options = TrainingOptions(seed=chosen.seed, start=chosen.start)
     scenario = Scenario.load(chosen.scenario)
-    return chosen.without, make_run("model-based", scenario, chosen.samples, settings, **options)
+    return chosen.without, make_run("model-based", scenario, chosen.samples, settings, options)
 
 
 def main() -> None:

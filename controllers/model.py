@@ -123,7 +123,7 @@ class ModelFunction:
                 "it returned an MX expression: build it of x, u, d and p, which are SX, alone"
             )
         function = ca.Function(
-            self.name,
+            "checked",
             list(symbols),
             [ca.SX(column)],
             {"allow_free": True},

@@ -15,8 +15,9 @@ from controllers.theta import Parameters
 from cosim.core.protocols import Array, Controller, Plant
 from cosim.core.simulation import indicators_of
 from cosim.core.statistics import gap_closed, regret
+from cosim.core.training_options import HELD_OUT
 from learning.log import METRICS
-from learning.training_run import HELD_OUT, TrainingRun
+from learning.training_run import TrainingRun
 from learning.verdict import cost_difference
 
 

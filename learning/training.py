@@ -29,6 +29,7 @@ from cosim.core.result import Result
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import functions_of, reporting, simulate
 from cosim.core.statistics import Estimate, shown
+from cosim.core.training_options import HELD_OUT, TrainingOptions, with_training_options
 from cosim.plant import FmuPlant
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
@@ -38,7 +39,7 @@ from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.evaluator import Evaluator
 from learning.log import LOG_COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
-from learning.training_run import HELD_OUT, TrainingRun, begin_training, make_run
+from learning.training_run import TrainingRun, begin_training, make_run
 from learning.verdict import WORSE, Verdict, verdict
 
 if TYPE_CHECKING:
@@ -287,62 +288,40 @@ class Tracker(Protocol):
         """Note the result, finished or diverged."""
 
 
+@with_training_options()
 def train(
     algorithm: str,
     scenario: Scenario | str | Path = "paper",
     samples: int | None = None,
     *,
-    seed: int = 0,
-    start: str | Path = TrainingRun.start,
     settings: Mapping[str, Any] | Configuration | None = None,
-    controller: str = TrainingRun.controller,
-    log_every: int | None = None,
-    evaluate_every: int | None = None,
-    checkpoint_every: int | None = None,
-    evaluation_seeds: int = TrainingRun.evaluation_seeds,
-    evaluation_steps: int = TrainingRun.evaluation_steps,
-    divergence: float = TrainingRun.divergence,
-    rest_after: int | None = TrainingRun.rest_after,
     out: str | Path | None = None,
     resume: bool = False,
     progress: Callable[[int, LogRow], None] | bool = False,
+    **options: Any,
 ) -> Training:
     """Train a controller's θ on a scenario's plant; J* is that of its stored optimum, if any.
 
     Raises AlgorithmLookupError, ConfigurationError, ScenarioError, PlantError, CheckpointError,
     each in one line, before the work where that is possible; PrivilegeError where an algorithm asks
-    more of the plant than it requires. The arguments that are not below are `TrainingRun`'s.
+    more of the plant than it requires.
 
     Args:
         algorithm: a registered name (`learning.algorithm.algorithms`) or `module:Class`.
         scenario: a scenario, a preset's name or a TOML file.
         samples: plant samples; None: the algorithm's budget, else 50 000.
-        seed: seed of noise and exploration.
-        start: where θ starts: naive, tuned, backed-off, cautious or a parameters file.
         settings: hyperparameters by name; the algorithm's Configuration documents them.
         out: folder of the run's checkpoints; None keeps none. `Training.save` writes the rest.
         resume: go on from the checkpoint in `out`.
         progress: a function of the samples done and the log's last row, or a `Tracker`; True draws
             a bar.
+        options: fields of `TrainingOptions` by name: seed, start, evaluate_every, ….
     """
     if not isinstance(scenario, Scenario):
         scenario = Scenario.load(scenario)
-    run = make_run(
-        algorithm,
-        scenario,
-        samples,
-        settings,
-        seed=seed,
-        start=str(start),
-        controller=controller,
-        log_every=log_every,
-        evaluate_every=evaluate_every,
-        checkpoint_every=checkpoint_every,
-        evaluation_seeds=evaluation_seeds,
-        evaluation_steps=evaluation_steps,
-        divergence=divergence,
-        rest_after=rest_after,
-    )
+    if isinstance(options.get("start"), Path):
+        options["start"] = str(options["start"])
+    run = make_run(algorithm, scenario, samples, settings, TrainingOptions(**options))
     # Regret needs J*, which is solved for once and stored.
     optimum = stored_optimum(scenario)
     return run_training(

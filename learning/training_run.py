@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from math import gcd, inf
+from dataclasses import KW_ONLY, dataclass, fields, replace
+from math import gcd, isfinite
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import spawn_seeds
+from cosim.core.training_options import HELD_OUT, MOST, Range, TrainingOptions, option_ranges
 from cosim.core.validation import suggestion
 from cosim.identity import depends_on
 from cosim.plant import FmuPlant
@@ -30,75 +31,53 @@ from learning.loop import TrainingLoop
 
 DEFAULT_SAMPLES = 50_000
 """Length of a run where neither user nor algorithm states one."""
-HELD_OUT = 1_000_000
-"""First of the held-out seeds; training seeds stay below."""
 STARTS = ("naive", "tuned", "backed-off", "cautious")
 CARRIERS = ("rti", "converged")
 """Controllers that can carry θ."""
-COUNTS = (
-    "samples", "log_every", "evaluate_every", "checkpoint_every",
-    "evaluation_seeds", "evaluation_steps", "rest_after",
-)  # fmt: skip
-"""Attributes of a `TrainingRun` that are whole numbers from 1 on."""
-OPTIONAL = ("samples", "log_every", "evaluate_every", "checkpoint_every", "rest_after")
-"""Options of a training that may be None."""
+LOG_EVERY = 1000
+"""Samples per row of the log, where nothing else is asked for."""
+EVALUATE_EVERY = 5000
+"""Samples per greedy evaluation and per checkpoint, about, likewise."""
+KINDS: dict[str, type] = {"int": Integral, "float": Real, "str": str}
+"""Types that stand for a field's, NumPy's numbers among them."""
+WORDS = {"int": "a whole number", "float": "a number", "str": "a text"}
+"""The same in messages."""
 
 
 @dataclass(frozen=True)
-class TrainingRun:
+class TrainingRun(TrainingOptions):
     """The identity of a training run; only an identical one can resume a checkpoint.
+
+    A run has diverged, and ends, where its greedy J exceeds the larger of the naive θ's and the
+    start's by more than (divergence − 1) of its magnitude, twice in a row or at the end.
 
     Attributes:
         algorithm: name of a registered one, or `module:Class`.
         scenario: the plant, its bounds and costs.
         samples: of the plant.
-        seed: of noise and exploration.
         configuration: the hyperparameters; completed by what the scenario states.
-        controller: `rti` or `converged`; it carries θ.
         log_every: samples per row of the log.
         evaluate_every: samples per greedy evaluation of θ.
         checkpoint_every: samples per checkpoint.
-        evaluation_seeds: held-out seeds of an evaluation.
-        evaluation_steps: samples of each of them.
-        divergence: a run has diverged, and ends, where its greedy J exceeds the larger of the naive
-            θ's and the start's by more than (divergence − 1) of its magnitude, twice in a row or at
-            the end.
-        start: `naive`, `tuned`, `backed-off`, `cautious` or the path of a file of θ.
-        rest_after: samples after which θ stays and nothing explores; None: never.
 
     Raises:
-        ConfigurationError: counts that make no run.
+        ConfigurationError: options of another kind, or that make no run.
     """
 
     algorithm: str
     scenario: Scenario
     samples: int
-    seed: int
     configuration: Configuration
-    controller: str = "rti"
-    log_every: int = 1000
-    evaluate_every: int = 5000
-    checkpoint_every: int = 5000
-    evaluation_seeds: int = 4
-    evaluation_steps: int = 500
-    divergence: float = 1.5
-    start: str = "naive"
-    rest_after: int | None = None
+    _: KW_ONLY
+    log_every: int = LOG_EVERY
+    evaluate_every: int = EVALUATE_EVERY
+    checkpoint_every: int = EVALUATE_EVERY
 
     def __post_init__(self) -> None:
         completed = self.configuration.for_scenario(self.scenario)
         object.__setattr__(self, "configuration", completed)
-        if self.seed < 0:
-            raise ConfigurationError(f"seed must be at least 0, not {self.seed}")
-        if self.seed >= HELD_OUT:
-            raise ConfigurationError(
-                f"seed must be below {HELD_OUT}, not {self.seed}: the noise from there on is held "
-                "out, to evaluate what was learned"
-            )
-        for name in COUNTS:
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigurationError(f"{name} must be at least 1, not {value}")
+        _check_options(self)
+        _check_samples(self.samples)
         for name in ("evaluate_every", "checkpoint_every"):
             value = getattr(self, name)
             if value % self.log_every:
@@ -135,108 +114,99 @@ def make_run(
     scenario: Scenario,
     samples: int | None = None,
     settings: Mapping[str, Any] | Configuration | None = None,
-    *,
-    seed: int = 0,
-    start: str = TrainingRun.start,
-    controller: str = TrainingRun.controller,
-    log_every: int | None = None,
-    evaluate_every: int | None = None,
-    checkpoint_every: int | None = None,
-    evaluation_seeds: int = TrainingRun.evaluation_seeds,
-    evaluation_steps: int = TrainingRun.evaluation_steps,
-    divergence: float = TrainingRun.divergence,
-    rest_after: int | None = TrainingRun.rest_after,
+    options: TrainingOptions | None = None,
 ) -> TrainingRun:
-    """The run of an algorithm by name, checked; arguments that are not below are its attributes.
+    """The run of an algorithm by name, checked.
 
     Args:
-        samples: None: the algorithm's budget, else 50 000.
+        algorithm: name of a registered one, or `module:Class`.
+        scenario: the plant, its bounds and costs.
+        samples: of the plant; None: the algorithm's budget, else 50 000.
         settings: hyperparameters by name, or all of them.
-        log_every: where an interval is not given, it is near its default and fits the others.
-        evaluate_every: likewise.
-        checkpoint_every: likewise.
+        options: all others; an interval that is None is near its default and fits the others.
 
     Raises:
         AlgorithmLookupError: there is no such algorithm.
         ConfigurationError: settings or options of another kind, or that make no run.
     """
     rule = load_algorithm(algorithm)
-    _check_options(
-        {
-            "samples": samples,
-            "seed": seed,
-            "start": start,
-            "controller": controller,
-            "log_every": log_every,
-            "evaluate_every": evaluate_every,
-            "checkpoint_every": checkpoint_every,
-            "evaluation_seeds": evaluation_seeds,
-            "evaluation_steps": evaluation_steps,
-            "divergence": divergence,
-            "rest_after": rest_after,
-        }
-    )
+    if options is None:
+        options = TrainingOptions()
     if settings is not None and not isinstance(settings, Configuration | Mapping):
         raise ConfigurationError(f"settings must be a table, not a {type(settings).__name__}")
     if not isinstance(settings, Configuration):
         settings = rule.Configuration.from_dict(dict(settings or {}))
     if samples is None:
         samples = getattr(rule, "budget", DEFAULT_SAMPLES)
+    options = _with_intervals(options)
+    return TrainingRun(algorithm, scenario, samples, settings, **vars(options))
+
+
+def _with_intervals(options: TrainingOptions) -> TrainingOptions:
+    """Options with each interval of log, evaluations and checkpoints; raises ConfigurationError."""
+    _check_options(options)
+    log_every = options.log_every
     if log_every is None:
-        log_every = _fitting_log_interval(evaluate_every, checkpoint_every)
-    # Evaluations near their default, on rows of the log.
-    rows = max(1, round(TrainingRun.evaluate_every / max(1, log_every)))
-    return TrainingRun(
-        algorithm=algorithm,
-        scenario=scenario,
-        samples=samples,
-        seed=seed,
-        configuration=settings,
-        controller=controller,
+        log_every = _fitting_log_interval(options.evaluate_every, options.checkpoint_every)
+    # Near their default, on rows of the log.
+    near_default = log_every * max(1, round(EVALUATE_EVERY / log_every))
+    return replace(
+        options,
         log_every=log_every,
-        evaluate_every=rows * log_every if evaluate_every is None else evaluate_every,
-        checkpoint_every=rows * log_every if checkpoint_every is None else checkpoint_every,
-        evaluation_seeds=evaluation_seeds,
-        evaluation_steps=evaluation_steps,
-        divergence=divergence,
-        start=start,
-        rest_after=rest_after,
+        evaluate_every=options.evaluate_every or near_default,
+        checkpoint_every=options.checkpoint_every or near_default,
     )
-
-
-def _check_options(options: Mapping[str, Any]) -> None:
-    """Refuse options of another kind than the attributes of `TrainingRun` by ConfigurationError."""
-    for name, value in options.items():
-        if value is None and name in OPTIONAL:
-            continue
-        kind: type = Integral
-        words = "a whole number"
-        if name in ("start", "controller"):
-            kind = str
-            words = "a text"
-        elif name == "divergence":
-            kind = Real
-            words = "a number"
-        # Python's bool is an integer, a TOML file's is not.
-        if not isinstance(value, kind) or isinstance(value, bool):
-            raise ConfigurationError(f"training: {name} must be {words}, not {value!r:.60}")
-    divergence = options["divergence"]
-    if not 1.0 <= divergence < inf:
-        raise ConfigurationError(f"training: divergence must be at least 1, not {divergence}")
-    if options["controller"] not in CARRIERS:
-        raise ConfigurationError(
-            f"training: there is no controller '{options['controller']}'; there are rti and "
-            "converged"
-        )
 
 
 def _fitting_log_interval(evaluate_every: int | None, checkpoint_every: int | None) -> int:
     """Largest interval up to the default that divides the others where these are given."""
     together = gcd(evaluate_every or 0, checkpoint_every or 0)
-    interval = TrainingRun.log_every
+    interval = LOG_EVERY
     while together % interval:
         interval -= 1
     return interval
+
+
+def _check_options(options: TrainingOptions) -> None:
+    """Refuse options of another kind or outside their range by ConfigurationError."""
+    ranges = option_ranges()
+    for option in fields(TrainingOptions):
+        value = getattr(options, option.name)
+        # With postponed evaluation, a field's type is its text: `int | None`.
+        kind, _, alternative = str(option.type).partition(" | ")
+        if value is None and alternative == "None":
+            continue
+        # Python's bool is an integer, a TOML file's is not.
+        if isinstance(value, bool) or not isinstance(value, KINDS[kind]):
+            raise ConfigurationError(
+                f"training: {option.name} must be {WORDS[kind]}, not {value!r:.60}"
+            )
+        if option.name in ranges:
+            _check_range(option.name, getattr(options, option.name), ranges[option.name])
+    if options.controller not in CARRIERS:
+        raise ConfigurationError(
+            f"training: there is no controller '{options.controller}'; there are rti and converged"
+        )
+
+
+def _check_samples(samples: int) -> None:
+    """Refuse a number of samples that makes no run by ConfigurationError."""
+    if not isinstance(samples, Integral) or isinstance(samples, bool):
+        raise ConfigurationError(f"training: samples must be {WORDS['int']}, not {samples!r:.60}")
+    _check_range("samples", samples, Range(1, MOST))
+
+
+def _check_range(name: str, value: float, limits: Range) -> None:
+    """Refuse a number outside its range by ConfigurationError."""
+    if name == "seed" and value >= HELD_OUT:
+        raise ConfigurationError(
+            f"training: seed must be below {HELD_OUT}, not {value}: the noise from there on is "
+            "held out, to evaluate what was learned"
+        )
+    if not isfinite(value) or value < limits.least:
+        raise ConfigurationError(f"training: {name} must be at least {limits.least}, not {value}")
+    if limits.most is not None and value > limits.most:
+        raise ConfigurationError(f"training: {name} must be at most {limits.most}, not {value}")
 
 
 def begin_training(

@@ -138,7 +138,11 @@ def _structured(label: str) -> str:
     """A label of θ as FMI's structured names have it: `p[UA2]` becomes `p.UA2`."""
     block, bracket, rest = label.partition("[")
     inner = rest.removesuffix("]")
-    return label if not bracket or inner.replace(",", "").isdigit() else f"{block}.{inner}"
+    # FMI's arrays have numbers in brackets, and nothing else.
+    is_number = inner.replace(",", "").isdigit()
+    if not bracket or is_number:
+        return label
+    return f"{block}.{inner}"
 
 
 def write_fmu(
@@ -152,17 +156,20 @@ def write_fmu(
 ) -> Path:
     """Write the FMU of `sampled_controller` with a record of its scenario and θ."""
     system = sampled_controller(controller, scenario, measured)
+    labels = controller.parameters.blocks.labels
     record = {
         "scenario": scenario.to_dict(),
         "scenario_hash": scenario.hash,
-        "theta": dict(
-            zip(controller.parameters.blocks.labels, controller.theta.tolist(), strict=True)
-        ),
+        "theta": dict(zip(labels, controller.theta.tolist(), strict=True)),
         "theta_hash": controller.parameters.hash,
     }
-    document = (json.dumps(record, indent=2, default=repr) + "\n").encode()
+    text = json.dumps(record, indent=2, default=repr) + "\n"
     return build_model(
-        system, target, version, every_platform=every_platform, files={RECORD: document}
+        system,
+        target,
+        version,
+        every_platform=every_platform,
+        files={RECORD: text.encode()},
     )
 
 
@@ -188,6 +195,13 @@ def write_loop(
         if kind == "Enumeration" and types.get(f"{name}_number") == "Integer":
             del starts[name]
             starts[f"{name}_number"] = ("Integer", value)
-    names = (*plant.states, *measured), plant.actions
-    stop = 100 * scenario.sampling_time  # as in the FMU's own experiment
-    return write_ssp(target, controller, archive.path, *names, starts, stop_time=stop)
+    return write_ssp(
+        target,
+        controller,
+        archive.path,
+        (*plant.states, *measured),
+        plant.actions,
+        starts,
+        # As in the FMU's own experiment.
+        stop_time=100 * scenario.sampling_time,
+    )

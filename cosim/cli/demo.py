@@ -39,11 +39,11 @@ def demo(
     with cli.output(json) as out_:
         from cosim.cli.evaluate import show_evaluation
         from cosim.core.files import staged, temporary_folder
+        from cosim.core.training_options import HELD_OUT
         from cosim.core.trajectory import RunSignals
         from cosim.figures.style import save
         from cosim.figures.trajectory import overlay_figure
         from cosim.recording import record_overlay, record_training
-        from learning.training_run import HELD_OUT
 
         scenario = cosim.Scenario.load(SCENARIO)
         folder = cli.open_folder(out)

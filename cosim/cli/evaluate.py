@@ -17,9 +17,9 @@ from cosim.core.files import staged, write_atomically
 def evaluate(
     controllers: Annotated[list[str], typer.Option("--controllers", "-c")] = ["naive"],  # noqa: B006
     scenario: cli.ScenarioOption = "paper",
-    seeds: Annotated[int, typer.Option(min=1, max=1_000_000)] = 10,
+    seeds: Annotated[int, typer.Option(min=1, max=1_000_000)] = 100,
     first_seed: Annotated[int, typer.Option(min=0)] = 0,
-    steps: cli.StepsOption = 1000,
+    steps: cli.StepsOption = 2500,
     out: cli.OutOption = Path("cosim-evaluation"),
     trajectories: Path | None = None,
     jobs: cli.JobsOption = None,

@@ -29,6 +29,7 @@ from cosim.cli import (
     train,
     view,
 )
+from cosim.cli.output import descriptions
 from cosim.core.errors import CosimError, CosimWarning
 from cosim.core.files import protect
 from cosim.core.processes import Interrupted, Terminated, command_process, unwound
@@ -48,12 +49,12 @@ OPTIONS_OF_PANELS = {
 PANELS = {name: panel for panel, names in OPTIONS_OF_PANELS.items() for name in names}
 
 
-def _documentation(command: object) -> tuple[str, dict[str, str]]:
-    """A command's text, with paragraphs as wide as the terminal, and those of its options."""
-    text, _, options = (getdoc(command) or "").partition("\n\nArgs:\n")
-    paragraphs = (paragraph.replace("\n", " ") for paragraph in text.split("\n\n"))
-    described = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", options, re.DOTALL | re.MULTILINE)
-    return "\n\n".join(paragraphs), {name: " ".join(words.split()) for name, words in described}
+def _help_text(command: object) -> str:
+    """What a command does: its docstring up to the arguments, a paragraph a line."""
+    text = (getdoc(command) or "").partition("\n\nArgs:\n")[0]
+    # A terminal breaks the lines where it ends.
+    paragraphs = [paragraph.replace("\n", " ") for paragraph in text.split("\n\n")]
+    return "\n\n".join(paragraphs)
 
 
 class _Commands(TyperGroup):
@@ -63,26 +64,38 @@ class _Commands(TyperGroup):
         """Refuse empty words: as a path, one would mean the working directory; protect inputs."""
         inputs: list[str] = []
         for before, word in pairwise(["", *args]):
+            # A value stands behind its option, or with it: `--out DIR`, `--out=DIR`.
             name, equals, value = word.partition("=")
-            if not word or (name.startswith("--") and equals and not value):
-                name = name or (before if before.startswith("-") else "")
+            is_empty_value = name.startswith("--") and bool(equals) and not value
+            if not word and before.startswith("-"):
+                name = before
+            if not word or is_empty_value:
                 what = f"the value of '{name}'" if name else "an argument"
                 raise CosimError(f"{what} is empty: give one, or leave it out")
-            if not {before, name} & set(OUTPUT_OPTIONS):
+            is_output = before in OUTPUT_OPTIONS or name in OUTPUT_OPTIONS
+            if not is_output:
+                # Any word may name a file that is read, alone or in a list of names.
                 inputs += [word, *re.split("[,=]", word)]
         protect(inputs)
-        if ctx.resilient_parsing or {"-h", "--help"} & {*args}:  # completion says what help says
-            import typer.rich_utils
-
-            typer.rich_utils.RANGE_STRING = ""  # [1<=x<=100000000] takes a narrow terminal's room
-            commands: list[Any] = [*self.commands.values()]
-            for command in commands:
-                commands += getattr(command, "commands", {}).values()
-                described = _documentation(command.callback)[1]
-                for option in command.params:
-                    option.rich_help_panel = PANELS.get(option.name, option.rich_help_panel)
-                    option.help = described.get(option.name, option.help)
+        # Completion says what the help says.
+        if ctx.resilient_parsing or "-h" in args or "--help" in args:
+            self._describe_options()
         return super().parse_args(ctx, args)
+
+    def _describe_options(self) -> None:
+        """Give each option of each command its text and its panel: only the help shows them."""
+        import typer.rich_utils
+
+        # [1<=x<=100000000] takes a narrow terminal's room.
+        typer.rich_utils.RANGE_STRING = ""
+        commands: list[Any] = [*self.commands.values()]
+        # A group's own commands are put behind it, and come in their turn.
+        for command in commands:
+            commands += getattr(command, "commands", {}).values()
+            described = descriptions(command.callback, "Args")
+            for option in command.params:
+                option.rich_help_panel = PANELS.get(option.name, option.rich_help_panel)
+                option.help = described.get(option.name, option.help)
 
     def invoke(self, ctx: Any) -> Any:
         """Let Ctrl-C through, which Typer would end without a word."""
@@ -132,8 +145,8 @@ for panel, function, example in (
     (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
     (RUN_PANEL, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
-    text, epilog = _documentation(function)[0], f"Example: cosim {example}"
-    app.command(rich_help_panel=panel, help=text, epilog=epilog)(function)
+    epilog = f"Example: cosim {example}"
+    app.command(rich_help_panel=panel, help=_help_text(function), epilog=epilog)(function)
 for panel, group, name, *examples in (
     (BUILD, scenario.scenario_app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
     (
@@ -150,7 +163,8 @@ for panel, group, name, *examples in (
     texts = [f"Example: cosim {name} {example}" for example in examples]
     app.add_typer(group, name=name, rich_help_panel=panel, epilog=texts[0])
     for command, text in zip(group.registered_commands, texts, strict=True):
-        command.help, command.epilog = _documentation(command.callback)[0], text
+        command.help = _help_text(command.callback)
+        command.epilog = text
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70

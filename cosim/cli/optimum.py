@@ -54,19 +54,28 @@ def optimum(
 
 def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cli.Output) -> None:
     """Print J* of the plant as it is, at each value of its drifting parameters."""
-    names = list(policy.law.parameters)
+    drifting = policy.law.parameters
+    names = list(drifting)
     table = []
-    for k, gain in enumerate(policy.gains):
-        row = {name: values[k] for name, values in policy.law.parameters.items()}
-        table.append(row | {"J": gain})
-    rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
+    rows = []
+    for position, gain in enumerate(policy.gains):
+        row = {name: values[position] for name, values in drifting.items()}
+        row["J"] = gain
+        table.append(row)
+        rows.append([f"{value:.4f}" for value in row.values()])
+    # The mean stands under the first parameter, the cells of the others stay empty.
     blanks = [""] * (len(names) - 1)
-    rows.append(("mean", *blanks, f"{policy.gain:.4f}"))
+    rows.append(["mean", *blanks, f"{policy.gain:.4f}"])
     title = f"quasi-static reference of {task.name}: a reference, not a bound"
     out_.table(title, (*names, "J*"), rows)
-    document = {"scenario": task.name, "kind": "reference", "J": policy.gain}
-    document["objection"] = f"quasi-static: J* along {', '.join(names)}(t), no bound"
-    out_.json(document | {"table": table})
+    document = {
+        "scenario": task.name,
+        "kind": "reference",
+        "J": policy.gain,
+        "objection": f"quasi-static: J* along {', '.join(names)}(t), no bound",
+        "table": table,
+    }
+    out_.json(document)
 
 
 def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:

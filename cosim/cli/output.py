@@ -9,6 +9,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +26,18 @@ MOST = 100_000_000
 def count(*names: str, text: str | None = None) -> Any:
     """An option that is a number of samples."""
     return typer.Option(*names, min=1, max=MOST, help=text)
+
+
+def descriptions(documented: object, section: str) -> dict[str, str]:
+    """What a docstring says of each name in one of its sections, on one line each.
+
+    Args:
+        documented: what has the docstring.
+        section: heading of the section, `Args` or `Attributes`.
+    """
+    entries = (getdoc(documented) or "").partition(f"\n\n{section}:\n")[2]
+    found = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", entries, re.DOTALL | re.MULTILINE)
+    return {name: " ".join(words.split()) for name, words in found}
 
 
 ScenarioOption = Annotated[
@@ -77,22 +90,28 @@ class Output:
         from rich.table import Table
 
         console = Console()
+        # A file or pipe has no width: the table is as wide as it needs to be.
         if not console.is_terminal:
             console.width = 1000
-        columns = [[row[number] for row in rows] for number in range(len(header))]
+        columns: list[list[str]] = []
         widths: list[int] = []
-        for name, cells in zip(header, columns, strict=True):
+        for number, name in enumerate(header):
+            cells = [row[number] for row in rows]
+            columns.append(cells)
             # Cells are never folded; a heading may be, but that of the first column.
             words = name.split() if widths else [name]
-            widths.append(max(len(word) for word in [*cells, *words, ""]) + 3)
+            longest = max(len(word) for word in [*cells, *words, ""])
+            # A border, and a space on either side.
+            widths.append(longest + 3)
         for part in _fitting_tables(widths, console.width - 1):
             table = Table(title=escape(title), title_justify="left", min_width=len(title))
-            for k in part:
-                numbers = all(_is_number(cell) for cell in columns[k])
+            for number in part:
+                numbers = all(_is_number(cell) for cell in columns[number])
                 justify: Any = "right" if numbers else "left"
-                table.add_column(escape(header[k]), justify=justify, overflow="fold")
+                table.add_column(escape(header[number]), justify=justify, overflow="fold")
             for row in rows:
-                table.add_row(*(escape(row[k]) for k in part))
+                shown = [escape(row[number]) for number in part]
+                table.add_row(*shown)
             console.print(table)
 
     def json(self, document: Mapping[str, Any]) -> None:
@@ -116,11 +135,15 @@ def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:
     if widths[0] > room / 2:
         return [list(range(len(widths)))]
     tables = [[0]]
+    used = widths[0]
     for column in range(1, len(widths)):
-        width = widths[column] + sum(widths[k] for k in tables[-1])
-        if len(tables[-1]) > 1 and width > room:
+        # A table has one column beside the first, be it too wide.
+        has_another = len(tables[-1]) > 1
+        if has_another and used + widths[column] > room:
             tables.append([0])
+            used = widths[0]
         tables[-1].append(column)
+        used += widths[column]
     return tables
 
 

@@ -131,9 +131,12 @@ def _summary(results: cosim.StudyResults) -> dict[str, Any]:
     from cosim.studies.run import read_table
 
     timing = read_table(results.folder / TIMING, needed=["run"])
+    # JSON has null for a rank that is missing.
+    summary = results.summary.astype({"rank": object})
+    summary["rank"] = summary["rank"].where(summary["rank"].notna(), None)
     return {
         **results.about,
-        "summary": results.summary.to_dict("records"),
+        "summary": summary.to_dict("records"),
         "aggregate": results.aggregate.to_dict("records"),
         "timing": timing.set_index("run").to_dict("index"),
     }

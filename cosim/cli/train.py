@@ -11,33 +11,35 @@ import typer
 import cosim
 from cosim.cli import output as cli
 from cosim.core.errors import CosimError
+from cosim.core.training_options import TrainingOptions, option_ranges, with_training_options
 
 if TYPE_CHECKING:
     from learning.configuration import Hyperparameter
 
 
+def _as_option(name: str, kind: Any) -> Any:
+    """Annotation of the command's option that is the field `name` of `TrainingOptions`."""
+    limits = option_ranges().get(name)
+    least = None if limits is None else limits.least
+    most = None if limits is None else limits.most
+    text = cli.descriptions(TrainingOptions, "Attributes")[name]
+    return Annotated[kind, typer.Option(min=least, max=most, help=text)]
+
+
+@with_training_options(_as_option)
 def train(
     algorithm: Annotated[str, typer.Option("--algorithm", "-a")],
     scenario: cli.ScenarioOption = "paper",
     samples: Annotated[int | None, cli.count("--samples", "-n")] = None,
-    seed: Annotated[int, typer.Option(min=0, max=999_999)] = 0,
-    start: str = "naive",
     out: cli.OutOption = Path("cosim-train"),
     resume: Annotated[bool, typer.Option("--resume")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     assignments: Annotated[list[str] | None, typer.Option("--set")] = None,
     explain: Annotated[bool, typer.Option("--explain")] = False,
-    controller: str = "rti",
-    log_every: Annotated[int | None, cli.count()] = None,
-    evaluate_every: Annotated[int | None, cli.count()] = None,
-    checkpoint_every: Annotated[int | None, cli.count()] = None,
-    evaluation_seeds: Annotated[int, typer.Option(min=1, max=1_000_000)] = 4,
-    evaluation_steps: Annotated[int, cli.count()] = 500,
-    divergence: Annotated[float, typer.Option(min=1.0)] = 1.5,
-    rest_after: Annotated[int | None, cli.count()] = None,
     gif: Annotated[bool, typer.Option("--gif")] = False,
     record: cli.RecordOption = False,
     json: cli.JsonOption = False,
+    **options: Any,
 ) -> None:
     """Train a controller's θ; write parameters.toml, learning.csv, learning.png, summary.json.
 
@@ -47,21 +49,12 @@ def train(
     Args:
         algorithm: A registered one or module:Class.
         samples: Plant samples; default: the algorithm's, or 50 000.
-        seed: Seed of noise and exploration.
-        start: Where θ starts: naive, tuned, backed-off, cautious or a parameters file.
         resume: Go on from the folder's checkpoint.
         overwrite: Begin anew where the folder holds another run.
         assignments: Hyperparameter as name=value; may be repeated.
         explain: List the algorithm's hyperparameters and stop.
-        controller: What carries θ: rti or converged.
-        log_every: Samples per row of the log; default: 1000, or what fits the next.
-        evaluate_every: Samples per greedy evaluation; default: about 5000.
-        checkpoint_every: Samples per checkpoint; default: about 5000.
-        evaluation_seeds: Held-out runs per evaluation.
-        evaluation_steps: Samples of each of them.
-        divergence: Times the start's J at which a run has diverged.
-        rest_after: Samples after which θ stays and nothing explores; default: never.
         gif: Draw learning.gif too: the loop while θ is learned.
+        options: Those of `TrainingOptions`, each an option of the command.
     """
     with cli.output(json) as out_:
         from controllers.optimum import stored_optimum
@@ -80,16 +73,7 @@ def train(
             cosim.Scenario.load(scenario),
             samples,
             rule.Configuration.from_assignments(assignments or []),
-            seed=seed,
-            start=start,
-            controller=controller,
-            log_every=log_every,
-            evaluate_every=evaluate_every,
-            checkpoint_every=checkpoint_every,
-            evaluation_seeds=evaluation_seeds,
-            evaluation_steps=evaluation_steps,
-            divergence=divergence,
-            rest_after=rest_after,
+            TrainingOptions(**options),
         )
         folder = cli.open_folder(out)
         there = [name for name in TRAINING_FILES if (folder / name).exists()]

@@ -386,6 +386,32 @@ def _sign_flip_probability(differences: Array) -> float:
     return float(reached.mean())
 
 
+def median_over_runs(values: Array) -> Estimate:
+    """Median over R training runs.
+
+    The interval is a bootstrap's, which resamples the runs with a fixed seed (percentiles).
+
+    Args:
+        values: a figure of each run, (R,); infinite of one that diverged.
+
+    Returns:
+        The median; no interval for one run, or where a value is no number.
+    """
+    value = float(np.median(values))
+    if len(values) < 2 or np.isnan(values).any():
+        return Estimate(value)
+    rng = np.random.default_rng(0)
+    rows = rng.integers(len(values), size=(len(values), RESAMPLES))
+    return Estimate(value, _percentiles(np.median(values[rows], axis=0)))
+
+
+def _percentiles(resampled: Array) -> Interval:
+    """Interval of resampled values, some of which may be infinite."""
+    quantiles = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
+    low, high = np.quantile(resampled, quantiles, method="nearest")
+    return float(low), float(high)
+
+
 def two_way(
     cost: Array,
     optimum: Array,
@@ -418,7 +444,4 @@ def two_way(
     values = np.full((n_runs, draws), np.inf)
     values[finite] = terms[finite] @ weights / (below @ weights)
     rows = rng.integers(n_runs, size=(n_runs, draws))
-    medians = np.median(np.take_along_axis(values, rows, axis=0), axis=0)
-    quantiles = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
-    low, high = np.quantile(medians, quantiles, method="nearest")
-    return float(low), float(high)
+    return _percentiles(np.median(np.take_along_axis(values, rows, axis=0), axis=0))

@@ -368,8 +368,10 @@ def _height(axes: Axes, y: float) -> float:
     """Where an ordinate lies on the page, as a share of the axes' height."""
     to_page = axes.transData.transform
     low, high = axes.get_ylim()
-    bottom, top = to_page((0, low))[1], to_page((0, high))[1]
-    return float((to_page((0, y))[1] - bottom) / (top - bottom))
+    bottom = to_page((0, low))[1]
+    top = to_page((0, high))[1]
+    here = to_page((0, y))[1]
+    return float((here - bottom) / (top - bottom))
 
 
 def _label_end(axes: Axes, name: EndLabel, end: float, position: float) -> None:

@@ -198,11 +198,13 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
         samples_axis(axes, float(samples[-1]), "samples")
         title = f"TD error in the stage cost's unit, r.m.s. of the preceding {TD_WINDOW} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
-        most = max((values.shape[1] for values in moving.values()), default=0)
-        if most:
+        sizes = [values.shape[1] for values in moving.values()]
+        if sizes:
             handles = []
-            for entry_number, style in enumerate(styles[:most], start=1):
-                handles.append(Line2D([], [], linewidth=1.2, label=str(entry_number), **style))
+            # The largest block has all styles that are drawn.
+            for entry_number, style in enumerate(styles[: max(sizes)], start=1):
+                handle = Line2D([], [], linewidth=1.2, label=str(entry_number), **style)
+                handles.append(handle)
             title = "entry of its block, in the block's own unit"
             drawn.legend(handles=handles, loc="outside lower center", ncols=12, title=title)
     return drawn

@@ -173,6 +173,7 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
             summary = run.summary()
             violating = f"{100 * summary['violating_share']:.0f} % of samples violate"
             text = f"{shown_case(controller)}: J = {summary['J']:.0f}, {violating}"
+            # An empty line stands for the controller in the legend.
             rows[0].plot([], [], color=styles[controller].color, label=text)
         rows[0].plot([], [], color=BOUND, linestyle=DASHED, label="bound")
         rows[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.2)
@@ -251,14 +252,18 @@ def episode_image(
         panels = drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
         for name, panel in zip(names, panels, strict=True):
             panel.set_ylabel(label(name, units[name]))
-        for i, panel in enumerate(panels[: len(plant.states)]):
+        n_states = len(plant.states)
+        for i, panel in enumerate(panels[:n_states]):
             panel.plot(time, states[:, i], color=INK)
             _limits(panel, scenario.state_lower[i], scenario.state_upper[i])
-        for j, panel in enumerate(panels[len(plant.states) :]):
+        # An action is held from its sample to the next.
+        for j, panel in enumerate(panels[n_states:]):
             panel.stairs(actions[:, j], time, color=INK, baseline=None)
             _limits(panel, scenario.action_lower[j], scenario.action_upper[j])
         panels[-1].set_xlabel(f"time [{unit}]")
-        panels[-1].set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1.0)
+        # After a reset there is one state, and no range.
+        end = time[-1] if len(time) > 1 else time[0] + 1.0
+        panels[-1].set_xlim(time[0], end)
         drawn.align_ylabels()
         return _pixels(drawn)
 
@@ -274,7 +279,9 @@ def time_unit(time: Array) -> tuple[float, str]:
     duration = float(time[-1])
     if duration <= 300.0:
         return 1.0, "s"
-    return (60.0, "min") if duration <= 86400.0 else (3600.0, "h")
+    if duration <= 86400.0:
+        return 60.0, "min"
+    return 3600.0, "h"
 
 
 def _line(

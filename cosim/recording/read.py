@@ -63,11 +63,13 @@ def read_recording(path: str | Path) -> Recording:
             batches[chunk.entity_path].append(batch)
     rows_of = {entity: _stacked_rows(parts) for entity, parts in batches.items()}
     recording = Recording({}, np.empty(0, np.int64), np.empty(0), {}, _properties(static), [], {})
+    # The writer marks an entity of signals by their names; bounds and status are unmarked.
     marked = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
     if not marked:
         raise RecordingError(f"{path} holds no signals of rti-cosim")
     signals: dict[str, NDArray[np.float64]] = {}
-    samples, time = recording.samples, recording.time
+    samples = recording.samples
+    time = recording.time
     for entity, texts in marked.items():
         names = texts[f"{SIGNAL}:name"]
         units = texts.get(f"{SIGNAL}:unit", [])
@@ -81,12 +83,15 @@ def read_recording(path: str | Path) -> Recording:
         values = _values(rows, len(names))
         moments = _time(rows)
         if entity.startswith("/intermediate/"):
-            order = moments.argsort(kind="stable")
-            recording.intermediate[names[0]] = np.column_stack([moments, *values])[order]
+            states = np.column_stack([moments, *values])
+            in_time = moments.argsort(kind="stable")
+            recording.intermediate[names[0]] = states[in_time]
             continue
         signals |= dict(zip(names, values, strict=True))
+        # The entity with the most rows has all samples.
         if len(rows) > len(samples):
-            samples, time = np.asarray(rows[SAMPLE]), moments
+            samples = np.asarray(rows[SAMPLE])
+            time = moments
     status = _status(rows_of[STATUS], samples) if STATUS in rows_of else []
     in_order = dict(sorted(signals.items()))
     return replace(recording, signals=in_order, samples=samples, time=time, status=status)

@@ -132,7 +132,10 @@ class RerunRecorder:
         time = columns["time"]
         samples = np.arange(first, first + len(status))
         rows = times(samples, time)
-        self._record_signals(stream, columns, rows, times(samples[[0, -1]], time[[0, -1]]))
+        # Bounds are lines from the first sample to the last.
+        ends = times(samples[[0, -1]], time[[0, -1]])
+        self._record_signals(stream, columns, rows, ends)
+        # A solution may be exact, and a failed one has no residual.
         with np.errstate(divide="ignore", invalid="ignore"):
             residual = np.log10(columns["residual"])
         stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
@@ -141,7 +144,9 @@ class RerunRecorder:
         for name, channels in self._predicted.items():
             if name not in columns:
                 continue
-            for channel, values in zip(channels, np.moveaxis(columns[name], 2, 0), strict=False):
+            # (K, stages, n): a channel for each state or action, a line in it for each stage.
+            of_each_entry = np.moveaxis(columns[name], 2, 0)
+            for channel, values in zip(channels, of_each_entry, strict=False):
                 channel.labels = [f"+{stage}" for stage in range(values.shape[1])]
                 stream.send([channel], rows, values)
         self._record_intermediate(stream, samples, time)
@@ -158,7 +163,9 @@ class RerunRecorder:
         values_of: dict[str, list[Array]] = {}
         for kind, channels in self._kinds.items():
             column = columns[kind.name]
-            for channel, values in zip(channels, column.reshape(len(column), -1).T, strict=True):
+            # A vector's entries are channels of their own.
+            entries = column.reshape(len(column), -1).T
+            for channel, values in zip(channels, entries, strict=True):
                 channels_of.setdefault(channel.entity, []).append(channel)
                 values_of.setdefault(channel.entity, []).append(values)
         for entity, channels in channels_of.items():
@@ -173,9 +180,12 @@ class RerunRecorder:
             if word != self._status:
                 changes.append(row)
             self._status = word
-        if changes:
-            words = rr.StateChange.columns(state=[drawable(status[row]) for row in changes])
-            stream.rerun.send_columns(_STATUS_ENTITY, times(samples[changes], time[changes]), words)
+        if not changes:
+            return
+        words = [drawable(status[row]) for row in changes]
+        states = rr.StateChange.columns(state=words)
+        rows = times(samples[changes], time[changes])
+        stream.rerun.send_columns(_STATUS_ENTITY, rows, states)
 
     def _record_intermediate(self, stream: Stream, samples: NDArray[np.int64], time: Array) -> None:
         """Send what `intermediate` took since the last call."""
@@ -221,12 +231,17 @@ class RerunRecorder:
         along = axis(AT(seconds=0.0), AT(seconds=self._seconds))
         loop = []
         for channel in self._group("states", "actions"):
-            shown = [channel]
-            shown += [fine for fine in self._fine if fine.name == channel.name and fine.window()]
+            shown_channels = [channel]
+            # States within a sample lie in the view of the state, where a run has any.
+            for fine in self._fine:
+                if fine.name == channel.name and fine.window():
+                    shown_channels.append(fine)
             # What is measured and estimated of a state is drawn over it.
             known = (f"measured[{channel.name}]", f"estimated[{channel.name}]")
-            shown += [sensor for sensor in self._group("sensors") if sensor.name in known]
-            loop.append(view(channel.title, shown, along))
+            for sensor in self._group("sensors"):
+                if sensor.name in known:
+                    shown_channels.append(sensor)
+            loop.append(view(channel.title, shown_channels, along))
         causes: list[rrb.View] = []
         for channel in self._group("costs"):
             causes.append(view(channel.title, [channel], along))
@@ -551,10 +566,12 @@ class Stream:
         for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
             if not isfinite(bound):
                 continue
-            line = Channel(f"bounds/{channel.entity}/{side}", f"{side} bound", color=BOUND_COLOR)
-            self.rerun.log(line.entity, _style([line]), static=True)
+            entity = f"bounds/{channel.entity}/{side}"
+            line = Channel(entity, f"{side} bound", color=BOUND_COLOR)
+            self.rerun.log(entity, _style([line]), static=True)
+            # The same level at both times makes a line.
             level = rr.Scalars.columns(scalars=[bound, bound])
-            self.rerun.send_columns(line.entity, ends, level)
+            self.rerun.send_columns(entity, ends, level)
 
     def close(self) -> None:
         """Finish the file, with the layout, and give it its name.

@@ -31,20 +31,23 @@ class SeedsTable(Table):
 
 
 class EvaluationTable(Table):
-    """Noise on which controllers and learnt θ are compared, the same for all of them."""
+    """Noise on which controllers and learned θ are compared, the same for all of them."""
 
     first_seed: Seed = 100_000
     """First noise seed; no training and no curve may meet it."""
-    seeds: PerScenario = 50
-    """Number of noise seeds."""
-    steps: PerScenario = 1000
+    seeds: PerScenario = 100
+    """Number of noise seeds: violations are rare and dear, so that few seeds rank nothing."""
+    steps: PerScenario = 2500
     """Samples on each."""
     burn_in: Annotated[int, Field(ge=0, le=100_000_000)] = 0
     """Samples run before those that count: with 0 the run starts at the plant's initial state."""
 
 
 class CurvesTable(Table):
-    """Learning curves: greedy evaluations of θ while training goes on."""
+    """Learning curves: greedy evaluations of θ while training goes on.
+
+    In operation it may be left out: θ is then evaluated on the noise of `[evaluation]`.
+    """
 
     points: RunCount = 20
     """Greedy evaluations of each training, evenly over its samples."""
@@ -57,8 +60,9 @@ class CurvesTable(Table):
 class OperationTable(Table):
     """Learning in operation: every training runs from one plant sample to the next, without reset.
 
-    Its θ is judged, greedily, at the given times, each on the plant as it is then, on the noise of
-    `[curves]`. Algorithms ask for `operation`; the last time is the length of every run.
+    Its θ is evaluated, greedily, at the given times, each on the plant as it is then, on the noise
+    of `[evaluation]`, or of `[curves]` where the file has that table. Algorithms require
+    `operation`; the last time is the length of every run.
     """
 
     hours: Hours | dict[str, Hours]

@@ -57,10 +57,13 @@ def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Fi
         axes = drawn.subplots()
         values = style.dot_rows(axes, rows, styles)
         upper_ends = [row.high for row in rows]
-        style.regret_axis(axes, "x", np.append(values, [0.0, *upper_ends]))
+        shown_values = np.append(values, [0.0, *upper_ends])
+        style.regret_axis(axes, "x", shown_values)
+        # An arrow stands where an interval leaves the axes.
         left = axes.get_xlim()[0]
-        cut = [y for y, row in enumerate(rows) if row.low < left]
-        axes.plot([left] * len(cut), cut, "<", color=style.INK, markersize=3, clip_on=False)
+        cut = [place for place, row in enumerate(rows) if row.low < left]
+        left_edge = np.full(len(cut), left)
+        axes.plot(left_edge, cut, "<", color=style.INK, markersize=3, clip_on=False)
         axes.set_xlabel("regret % of runs (crosses diverged); interquartile mean, 95 % interval")
     return drawn
 
@@ -87,22 +90,27 @@ def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
         log: rows (training_seed, samples, J, greedy_J); greedy_J is NaN between evaluations.
         best: J*; costs are then regrets in %.
     """
-    runs = []
-    for _, rows in log.groupby("training_seed", sort=False):
-        evaluated = rows.greedy_J.notna()
-        # Rows up to a greedy evaluation belong to it: number them by the evaluations that follow.
-        evaluations_left = evaluated[::-1].cumsum()[::-1]
-        costs = rows.J.groupby(-evaluations_left).mean().iloc[: evaluated.sum()]
-        points = [rows.samples[evaluated], costs, rows.greedy_J[evaluated]]
-        runs.append(np.array(points, dtype=np.float64))
-    longest = max(runs, key=lambda run: run.shape[1])
-    n_points = longest.shape[1]
-    training = np.array([_padded(run[1], n_points) for run in runs])
-    greedy = np.array([_padded(run[2], n_points) for run in runs])
+    runs = [_points_of_a_run(rows) for _, rows in log.groupby("training_seed", sort=False)]
+    longest = max(runs, key=lambda points: points.shape[1])
+    samples = longest[0]
+    training = np.array([_padded(points[1], len(samples)) for points in runs])
+    greedy = np.array([_padded(points[2], len(samples)) for points in runs])
     if best is not None:
         training = 100 * regrets(training, best)
         greedy = 100 * regrets(greedy, best)
-    return LearningCurve(longest[0], training, greedy)
+    return LearningCurve(samples, training, greedy)
+
+
+def _points_of_a_run(log: pd.DataFrame) -> Array:
+    """Samples, mean training cost and greedy cost at each greedy evaluation of a run, (3, K)."""
+    evaluated = log.greedy_J.notna()
+    # Rows up to a greedy evaluation belong to it: number them by the evaluations that follow.
+    evaluations_left = evaluated[::-1].cumsum()[::-1]
+    training = log.J.groupby(-evaluations_left).mean()
+    # Rows behind the last evaluation make no point.
+    training = training.iloc[: evaluated.sum()]
+    points = [log.samples[evaluated], training, log.greedy_J[evaluated]]
+    return np.array(points, dtype=np.float64)
 
 
 def _padded(values: Array, length: int) -> Array:
@@ -189,7 +197,8 @@ def _draw_bands(
     medians = []
     for name, curve in curves.items():
         finite = np.isfinite(costs[name]).all(axis=0)
-        samples, values = curve.samples[finite], costs[name][:, finite]
+        samples = curve.samples[finite]
+        values = costs[name][:, finite]
         if not values.size:
             continue
         low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
@@ -231,7 +240,8 @@ def operation_figure(
     if layout.drawn:
         runs = runs[runs.case.isin(layout.drawn)]
     lines = palette([str(case) for case in runs.case.unique()])
-    first, last = float(runs.samples.min()), float(runs.samples.max())
+    first = float(runs.samples.min())
+    last = float(runs.samples.max())
     titles = {
         "regret": "regret % of θ at that time",
         "life_regret": "regret % of all samples so far",
@@ -367,11 +377,14 @@ def increments(log: pd.DataFrame) -> dict[str, Array]:
     """θ less its first row by block, (K, entries), of a training's log of K rows."""
     theta = log.filter(like=THETA_PREFIX).astype(float)
     changes = theta - theta.iloc[0]
-    columns: dict[str, list[Array]] = {}
-    for name in theta:
-        block = str(name).removeprefix(THETA_PREFIX).partition("[")[0]
-        columns.setdefault(block, []).append(changes[name].to_numpy())
-    return {block: np.column_stack(values) for block, values in columns.items()}
+    entries: dict[str, list[Array]] = {}
+    for column in theta:
+        # A column is called `theta BLOCK[i,j]`.
+        entry = str(column).removeprefix(THETA_PREFIX)
+        block = entry.partition("[")[0]
+        values = changes[column].to_numpy()
+        entries.setdefault(block, []).append(values)
+    return {block: np.column_stack(columns) for block, columns in entries.items()}
 
 
 def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure:
@@ -412,15 +425,19 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
 
 def _common_bins(samples: Sequence[Array], bound: float) -> tuple[Array, float]:
     """Edges of bins for several histograms, of which one is `bound`, and the bins' width."""
-    low, high = np.quantile(np.concatenate(samples), (0.001, 0.999))
-    low, high = min(float(low), bound), max(float(high), bound)
+    all_samples = np.concatenate(samples)
+    low = min(float(np.quantile(all_samples, 0.001)), bound)
+    high = max(float(np.quantile(all_samples, 0.999)), bound)
     width = (high - low) / BINS
+    # Not narrower than the smallest sample can fill (Freedman and Diaconis' rule).
     for values in samples:
-        # Not narrower than the smallest sample can fill (Freedman and Diaconis' rule).
-        spread = np.subtract(*np.quantile(values, (0.75, 0.25)))
+        lower_quartile, upper_quartile = np.quantile(values, (0.25, 0.75))
+        spread = upper_quartile - lower_quartile
         width = max(width, float(2 * spread / np.cbrt(len(values))))
-    if not width:  # all samples are one number
+    # All samples may be one number.
+    if not width:
         width = 1e-3 * max(abs(bound), 1.0)
+    # Edges are whole widths from the bound, one bin more than needed on either side.
     below = -np.ceil((bound - low) / width) - 1
     above = np.ceil((high - bound) / width) + 2
     edges: Array = bound + width * np.arange(below, above)
@@ -446,12 +463,16 @@ def phase_figure(
     x = np.linspace(low[0], high[0], GRID)
     y = np.linspace(low[1], high[1], GRID)
     fields = {case: _field(policy, x, y, scenario) for case, policy in policies.items()}
-    longest = max(
-        float(np.nanmax(np.hypot(field[..., 0], field[..., 1]))) for field in fields.values()
-    )
+    # Arrows of all panels have one scale.
+    longest = 0.0
+    for field in fields.values():
+        lengths = np.hypot(field[..., 0], field[..., 1])
+        longest = max(longest, float(np.nanmax(lengths)))
     columns = 2 if len(runs) == 4 else min(len(runs), 3)
     rows = -(-len(runs) // columns)
-    half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
+    # The axes reach half a cell beyond the outermost arrows.
+    half_x = 0.5 * (x[1] - x[0])
+    half_y = 0.5 * (y[1] - y[0])
     extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
     signals = next(iter(runs.values())).signals
     with style.figure(7.0 / columns * rows + 0.4, style.WIDTH if columns > 1 else 4.2) as drawn:
@@ -462,9 +483,7 @@ def phase_figure(
             _draw_density(axes, run.states[:, :2], extent)
             _draw_arrows(axes, x, y, fields[case] / (longest or 1.0))
             axes.plot(*scenario.reference_state[:2], "+", color=BOUND, ms=9, mew=1.6, zorder=5)
-            for line, i in ((axes.axvline, 0), (axes.axhline, 1)):
-                for bound in (scenario.state_lower[i], scenario.state_upper[i]):
-                    line(bound, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
+            _draw_bounds(axes, scenario)
             axes.set_title(shown_case(case))
             axes.set_xlim(extent[:2])
             axes.set_ylim(extent[2:])
@@ -483,6 +502,14 @@ def phase_figure(
     return drawn
 
 
+def _draw_bounds(axes: Axes, scenario: Scenario) -> None:
+    """Draw the bounds of the first two states, across and upright."""
+    look: dict[str, Any] = {"color": BOUND, "linewidth": 1.0, "linestyle": DASHED, "zorder": 3}
+    for bounds in (scenario.state_lower, scenario.state_upper):
+        axes.axvline(bounds[0], **look)
+        axes.axhline(bounds[1], **look)
+
+
 def _field(policy: Policy, x: Array, y: Array, scenario: Scenario) -> Array:
     """First two inputs of a policy less the operating point, in shares of their range.
 
@@ -495,12 +522,13 @@ def _field(policy: Policy, x: Array, y: Array, scenario: Scenario) -> Array:
     Returns:
         The field, (Y, X, 2).
     """
-    width = (scenario.action_upper - scenario.action_lower)[:2]
+    input_range = scenario.action_upper - scenario.action_lower
     actions = np.empty((len(y), len(x), 2))
-    for i, second in enumerate(y):
-        for j, first in enumerate(x):
-            actions[i, j] = policy(np.array([first, second]))[:2]
-    field: Array = (actions - scenario.reference_action[:2]) / width
+    for row, second in enumerate(y):
+        for column, first in enumerate(x):
+            state = np.array([first, second])
+            actions[row, column] = policy(state)[:2]
+    field: Array = (actions - scenario.reference_action[:2]) / input_range[:2]
     return field
 
 
@@ -525,9 +553,17 @@ def _draw_arrows(axes: Axes, x: Array, y: Array, field: Array) -> None:
 def _draw_density(axes: Axes, states: Array, extent: tuple[float, float, float, float]) -> None:
     """Draw how often a run of states (K, 2) was where, within left, right, bottom and top."""
     left, right, bottom, top = extent
-    inside = (states > (left, bottom)).all(axis=1) & (states < (right, top)).all(axis=1)
+    x = states[:, 0]
+    y = states[:, 1]
+    inside = (x > left) & (x < right) & (y > bottom) & (y < top)
     cells = axes.hexbin(
-        *states[inside].T, gridsize=40, extent=extent, mincnt=1, linewidths=0.1, zorder=1
+        x[inside],
+        y[inside],
+        gridsize=40,
+        extent=extent,
+        mincnt=1,
+        linewidths=0.1,
+        zorder=1,
     )
     counts = cells.get_array()
     if counts is not None and counts.size:

@@ -22,13 +22,25 @@ from cosim.core.protocols import Array, Controller
 from cosim.core.result import TextTable
 from cosim.core.scenario import VIOLATING, Scenario
 from cosim.core.simulation import simulate
-from cosim.core.statistics import paired_difference, regrets, relative, shown
+from cosim.core.statistics import (
+    Estimate,
+    Interval,
+    median_over_runs,
+    paired_difference,
+    regrets,
+    relative,
+    shown,
+    two_way,
+)
 from cosim.plant import FmuPlant
+from cosim.studies.ranks import shared_ranks
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
 from learning.log import LogRow
 from learning.training_run import TrainingRun, begin_training
 
+WEEK = 7 * 86400.0
+"""Seconds of a week."""
 WINDOW = 100
 """Samples in a row of the worst window."""
 SHIFT = 480
@@ -185,8 +197,10 @@ def worst_window(cost: Array) -> float:
     if not np.isfinite(cost).all():
         return float("inf")
     width = min(WINDOW, len(cost))
-    total = np.concatenate([[0.0], np.cumsum(cost)])
-    return float((total[width:] - total[:-width]).max() / width)
+    # The sum over a window is a difference of sums from the start, which begin with 0.
+    sums = np.append(0.0, np.cumsum(cost))
+    window_sums = sums[width:] - sums[:-width]
+    return float(window_sums.max() / width)
 
 
 class ShiftComparison(NamedTuple):
@@ -213,14 +227,18 @@ def compare_shifts(before: Array, cost: Array) -> ShiftComparison:
     n_shifts = len(cost) // SHIFT
     if not n_shifts:
         return ShiftComparison(np.nan, np.nan)
+    whole_shifts = slice(0, n_shifts * SHIFT)
     # Of infinite costs a test has no value: they count by their mean.
     with np.errstate(invalid="ignore", divide="ignore"):
-        excess = (cost - before)[: n_shifts * SHIFT]
+        excess = cost[whole_shifts] - before[whole_shifts]
+        # Means of parts are nearly independent where neighbouring samples are not.
         parts = excess.reshape(n_shifts, SHIFT_PARTS, -1).mean(axis=2)
         p = ttest_1samp(parts, 0.0, axis=1, alternative="greater").pvalue
-    mean = parts.mean(axis=1)
-    higher = (p < SHIFT_LEVEL / n_shifts) | (mean == np.inf)
-    return ShiftComparison(float(higher.sum()), float(mean.max()))
+    mean_excess = parts.mean(axis=1)
+    # Bonferroni: one shift in twenty runs without an excess is found to be higher, not in each.
+    is_significant = p < SHIFT_LEVEL / n_shifts
+    is_higher = is_significant | (mean_excess == np.inf)
+    return ShiftComparison(float(is_higher.sum()), float(mean_excess.max()))
 
 
 def theta_at(log: str, mark: int) -> tuple[float, ...]:
@@ -266,26 +284,49 @@ def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> 
         optimum: name of the case whose J is J*; another name if there is none.
     """
     costs = _greedy_costs(greedy)
-    best = {mark: table.to_numpy()[0] for mark, table in costs.pop(optimum, {}).items()}
+    optimal_costs = costs.pop(optimum, None)
+    # A run's noise is that of its training seed, for as many samples.
     same_noise = ["training_seed", "samples"]
-    best_run = runs[runs.case == optimum].set_index(same_noise).J
-    if not best:
-        for mark in runs.samples.unique().tolist():
-            means = [by[mark].to_numpy().mean(axis=0) for by in costs.values() if mark in by]
-            best[mark] = min(means, key=np.mean)
+    if optimal_costs is not None:
+        best = {mark: table.to_numpy()[0] for mark, table in optimal_costs.items()}
+        best_run = runs[runs.case == optimum].set_index(same_noise).J
+    else:
+        best = _best_costs(costs, runs.samples.unique().tolist())
         best_run = runs.groupby(same_noise).J.min()
     run_key = ["case", *same_noise]
-    greedy_J = greedy.groupby(run_key).J.mean().rename("greedy_J").reset_index()
+    greedy_mean = greedy.groupby(run_key).J.mean()
+    greedy_J = greedy_mean.rename("greedy_J").reset_index()
     rows = runs[runs.case != optimum]
     rows = rows.merge(best_run.rename("optimal_J"), on=same_noise, how="left")
     rows = rows.merge(greedy_J, on=run_key, how="left")
-    best_mean = rows.samples.map({mark: float(cost.mean()) for mark, cost in best.items()})
-    rows["regret"] = regrets(rows.greedy_J.to_numpy(), best_mean.to_numpy())
+    # The greedy policies of a mark share its noise, the whole runs of a training seed theirs.
+    optimal_greedy = {mark: float(cost.mean()) for mark, cost in best.items()}
+    optimal_greedy_J = rows.samples.map(optimal_greedy).to_numpy()
+    rows["regret"] = regrets(rows.greedy_J.to_numpy(), optimal_greedy_J)
     optimal_J = rows.optimal_J.to_numpy()
     rows["life_regret"] = regrets(rows.J.to_numpy(), optimal_J)
     rows["dearest"] = regrets(rows.dearest.to_numpy(), optimal_J)
     rows["excess"] = relative(rows.excess.to_numpy(), optimal_J)
     return OperationResult(costs, best, rows)
+
+
+def _best_costs(
+    costs: Mapping[str, Mapping[int, pd.DataFrame]], marks: Sequence[int]
+) -> dict[int, Array]:
+    """Greedy J (S,) of the best case at each mark, its mean over the training seeds.
+
+    Args:
+        costs: greedy J of each case by mark, (R, S).
+        marks: samples of operation.
+    """
+    best = {}
+    for mark in marks:
+        means = []
+        for tables in costs.values():
+            if mark in tables:
+                means.append(tables[mark].to_numpy().mean(axis=0))
+        best[mark] = min(means, key=np.mean)
+    return best
 
 
 def _greedy_costs(greedy: pd.DataFrame) -> dict[str, dict[int, pd.DataFrame]]:
@@ -341,20 +382,19 @@ def operation_tables(
         against: the counterpart of each case, None where it has none.
         seconds: processor time in s of a case, up to the last column.
     """
-    titles = {
-        "regret": "Greedy regret in % of the θ that a run would hand over, median (worst)",
-        "life_regret": "Regret in % of the run so far, exploration included, median (worst)",
-    }
-    for name, title in titles.items():
-        rows = _regret_rows(result.runs, name, layout.columns)
-        yield f"{title}: `{scenario}`", ("case", *layout.times), rows
+    title = "Greedy regret in % of the final θ of a run that ends then, median [95 %] (worst)"
+    rows = _greedy_rows(result, layout.columns)
+    yield f"{title}: `{scenario}`", ("case", "rank at the end", *layout.times), rows
+    title = "Regret in % of the run so far, exploration included, median [95 %] (worst)"
+    rows = _run_rows(result.runs, layout.columns)
+    yield f"{title}: `{scenario}`", ("case", *layout.times), rows
     end = result.runs[result.runs.samples == layout.columns[-1]]
     header = (
-        "case", "runs", "first change, samples", "violating % since", "dearest 100 samples %",
-        "updates", "model samples", "processor s",
+        "case", "runs", "first change, samples", "violating % since", "violations a week [95 %]",
+        "dearest 100 samples %", "updates", "model samples", "processor s",
     )  # fmt: skip
     title = f"What {layout.times[-1]} of operation took on `{scenario}`, medians"
-    yield title, header, _effort_rows(end, seconds)
+    yield title, header, _effort_rows(end, seconds, WEEK / layout.sampling_time)
     if rows := _shift_rows(end):
         title = (
             f"Shifts of {SHIFT} samples dearer than θ as it starts, median (worst): `{scenario}`"
@@ -365,31 +405,88 @@ def operation_tables(
         yield title, ("case", *layout.times), rows
 
 
-def _regret_rows(runs: pd.DataFrame, name: str, marks: Sequence[int]) -> list[list[str]]:
-    """Median and worst regret of each case at each mark."""
-    grid = runs.pivot_table(
-        index="case", columns="samples", values=name, aggfunc=["median", "max"], sort=False
-    )
+def _greedy_rows(result: OperationResult, marks: Sequence[int]) -> list[list[str]]:
+    """Rank, and greedy regret with its interval over training seeds and noise, of each case."""
+    ranks = _ranks_at(result, marks[-1])
     rows = []
-    for case, row in grid.iterrows():
-        cells = [
-            f"{_shown_percent(row['median'][m])} ({_shown_percent(row['max'][m])})" for m in marks
-        ]
-        rows.append([str(case), *cells])
+    for case, runs in result.runs.groupby("case", sort=False):
+        name = str(case)
+        rank = ranks.get(name)
+        cells = [name, "" if rank is None else str(rank)]
+        for mark in marks:
+            regret = runs[runs.samples == mark].regret.to_numpy()
+            cost = result.greedy[name][mark].to_numpy()
+            cells.append(_regret_cell(regret, two_way(cost, result.optimum[mark])))
+        rows.append(cells)
     return rows
 
 
-def _effort_rows(end: pd.DataFrame, seconds: Mapping[str, float]) -> list[list[str]]:
-    """What each case's median run took, of the rows at the last mark."""
+def _run_rows(runs: pd.DataFrame, marks: Sequence[int]) -> list[list[str]]:
+    """Regret of each case's whole runs, with its interval over the runs, each on its own noise."""
+    rows = []
+    for case, case_runs in runs.groupby("case", sort=False):
+        cells = [str(case)]
+        for mark in marks:
+            regret = case_runs[case_runs.samples == mark].life_regret.to_numpy()
+            cells.append(_regret_cell(regret, median_over_runs(regret).interval))
+        rows.append(cells)
+    return rows
+
+
+def _regret_cell(regret: Array, interval: Interval) -> str:
+    """Median of the regrets (R,) of the runs in %, its interval, and the worst."""
+    if not len(regret):
+        return ""
+    median = shown(float(np.median(regret)), interval, 100.0, 3)
+    return f"{median} ({_shown_percent(regret.max())})"
+
+
+def _ranks_at(result: OperationResult, mark: int) -> dict[str, int | None]:
+    """Ranks of the cases by the median greedy J of their θ at a mark."""
+    medians: dict[str, float] = {}
+    trained_once = []
+    for case, tables in result.greedy.items():
+        if mark not in tables:
+            continue
+        medians[case] = float(tables[mark].mean(axis=1).median())
+        if len(tables[mark]) < 2:
+            trained_once.append(case)
+
+    def is_worse(case: str, leader: str) -> bool:
+        one, two = _pairs(result, case, leader, mark)
+        # Without a training seed in common nothing is known.
+        if not one.size:
+            return False
+        interval = paired_difference(one, two, result.optimum[mark])[1]
+        return interval is not None and interval[0] > 0
+
+    return shared_ranks(sorted(medians, key=medians.__getitem__), trained_once, is_worse)
+
+
+def _effort_rows(
+    end: pd.DataFrame, seconds: Mapping[str, float], samples_per_week: float
+) -> list[list[str]]:
+    """What each case's median run took.
+
+    Args:
+        end: rows of the runs at the last mark.
+        seconds: processor time of each case.
+        samples_per_week: of the plant.
+    """
     by_case = end.groupby("case", sort=False)
     counts = by_case.size()
     rows = []
     for case, row in by_case.median(numeric_only=True).iterrows():
+        violating = end[end.case == case].violating.dropna().to_numpy()
+        violations = Estimate(np.nan)
+        if len(violating):
+            violations = median_over_runs(violating * samples_per_week)
         cells = [
             str(case),
             str(counts[case]),
             _whole(row.first_change),
             f"{100 * row.violating:.2f}",
+            "" if np.isnan(violations.value) else shown(*violations, digits=3),
             f"{100 * row.dearest:.1f}",
             _whole(row.updates),
             _whole(row.model_samples),
@@ -421,17 +518,25 @@ def _difference_rows(
             continue
         cells = [f"{case} − {other}"]
         for mark in marks:
-            one, two = costs[mark], other_costs[mark]
-            # Of two trainings the seeds that both have; a controller has one row, for any seed.
-            common = one.index.intersection(two.index)
-            if len(common):
-                one, two = one.loc[common], two.loc[common]
-            pair = np.broadcast_arrays(one, two)
-            value, interval, p = paired_difference(pair[0], pair[1], result.optimum[mark])
+            one, two = _pairs(result, case, other, mark)
+            value, interval, p = paired_difference(one, two, result.optimum[mark])
             said = shown(value, interval, 100, 3)
             cells.append(said if np.isnan(p) else f"{said}, p {p:.2f}")
         rows.append(cells)
     return rows
+
+
+def _pairs(result: OperationResult, case: str, other: str, mark: int) -> tuple[Array, Array]:
+    """Greedy J (R, S) of two cases at a mark, over the training seeds that both have."""
+    one = result.greedy[case][mark]
+    two = result.greedy[other][mark]
+    common = one.index.intersection(two.index)
+    # A controller has one row, for any seed.
+    if len(common):
+        one = one.loc[common]
+        two = two.loc[common]
+    pair = np.broadcast_arrays(one, two)
+    return pair[0], pair[1]
 
 
 def _shown_percent(share: float) -> str:

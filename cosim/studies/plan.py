@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -16,6 +16,7 @@ from cosim.core.errors import StudyError
 from cosim.core.modules import import_from
 from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario, resolved
+from cosim.core.training_options import HELD_OUT, OPTION_NAMES, TrainingOptions
 from cosim.core.validation import instead, validated
 from cosim.evaluation import EVALUATION
 from cosim.identity import code_hash, versions
@@ -34,7 +35,6 @@ from cosim.studies.run import (
 from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training_run import HELD_OUT
 
 BASELINES, NAIVE = "baselines", "naive"
 TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"
@@ -45,11 +45,8 @@ BETWEEN_CHECKPOINTS = 5000
 """Samples between two checkpoints, about."""
 MOST_SAMPLES = 100_000_000
 """Samples of the longest run."""
-TRAINING_OPTIONS = (
-    "log_every", "evaluate_every", "checkpoint_every", "evaluation_seeds", "evaluation_steps",
-    "divergence", "rest_after",
-)  # fmt: skip
-"""What a case's table `training` may say."""
+GIVEN_BY_STUDY = ("controller", "seed", "start")
+"""Options of a training that a case's table `training` may not say."""
 GRID_FIELDS = ("samples", "start", "nmpc")
 """Fields of a case, beside its settings, that may be a grid."""
 Choice = TypeVar("Choice")
@@ -155,8 +152,9 @@ class Study:
         for scenario in self.scenarios:
             evaluation_seeds = set(self.noise(scenario).seeds)
             self._check_unmet(evaluation_seeds & training_seeds, "a training seed")
-            held_out = set(self.held_out(scenario).seeds)
-            self._check_unmet(evaluation_seeds & held_out, "a seed of the curves")
+            if self.has_curves:
+                held_out = set(self.held_out(scenario).seeds)
+                self._check_unmet(evaluation_seeds & held_out, "a seed of the curves")
         return cases
 
     def _check_unmet(self, common: set[int], kind: str) -> None:
@@ -284,8 +282,20 @@ class Study:
         steps = self._of(self.table.curves.steps, scenario, "curves.steps")
         return Noise(tuple(range(HELD_OUT, HELD_OUT + count)), steps)
 
+    @property
+    def has_curves(self) -> bool:
+        """Whether greedy evaluations have noise of their own, that of `[curves]`."""
+        return self.table.operation is None or "curves" in self.table.model_fields_set
+
+    def noise_at_marks(self, scenario: str) -> Noise:
+        """Noise on which θ is evaluated at the times of operation."""
+        evaluation = self.noise(scenario)
+        if not self.has_curves:
+            return evaluation
+        return self.held_out(scenario)._replace(burn_in=evaluation.burn_in)
+
     def marks(self, scenario: str) -> tuple[int, ...]:
-        """Samples of operation at which a scenario's runs are judged; else empty."""
+        """Samples of operation at which a scenario's runs are evaluated; else empty."""
         if self.table.operation is None:
             return ()
         hours = self._of(self.table.operation.hours, scenario, "operation.hours")
@@ -334,23 +344,26 @@ class Study:
                     f"case '{case.name}': '{case.algorithm}' requires a {requires}, and a study in "
                     "operation has none"
                 )
-        for name in ("controller", "seed", "start"):
+        for name in GIVEN_BY_STUDY:
             if name in case.training:
                 raise ConfigurationError(f"training: {name} is given by the study itself")
-        _check_known(case.training, TRAINING_OPTIONS, "training", "option")
+        _check_known(case.training, OPTION_NAMES, "training", "option")
+        options = TrainingOptions(
+            seed=seed,
+            start=self.located(case.start),
+            controller=case.nmpc,
+            **self._intervals(samples, scenario),
+        )
         return TrainingJob(
             algorithm=case.algorithm,
             samples=samples,
-            seed=seed,
-            nmpc=case.nmpc,
-            start=self.located(case.start),
+            options=replace(options, **case.training),
             theta=theta,
             settings=case.settings,
-            options=self._intervals(samples, scenario) | dict(case.training),
             marks=marks,
         )
 
-    def _intervals(self, samples: int, scenario: str) -> dict[str, int | float | None]:
+    def _intervals(self, samples: int, scenario: str) -> dict[str, int]:
         """Options of a training that has the study's number of greedy evaluations."""
         curves = self.held_out(scenario)
         between = max(1, samples // self.table.curves.points)
@@ -485,12 +498,12 @@ def _noise(
     """
     noise = {EVALUATION: study.noise(name)}
     cases = [other for other in study.cases if name in other.scenarios]
-    if seed is None and any(other.algorithm for other in cases):
+    if seed is None and study.has_curves and any(other.algorithm for other in cases):
         # A level for the learning curves.
         noise[GREEDY] = study.held_out(name)
     at_marks = {f"greedy-{mark}.csv": mark for mark in marks}
     for file in at_marks:
-        noise[file] = study.held_out(name)._replace(burn_in=noise[EVALUATION].burn_in)
+        noise[file] = study.noise_at_marks(name)
     for table in _trajectories(study, case, name, seed):
         noise[table.file] = Noise((table.seed,), table.steps, whole=True)
     training_seeds: set[int] = set()

@@ -29,7 +29,7 @@ Text = Callable[[Mapping[str, Any]], str]
 
 REPORT_COLUMNS: dict[str, tuple[str, Text]] = {
     "case": ("case", lambda row: row["case"]),
-    "rank": ("rank", lambda row: str(row["rank"])),
+    "rank": ("rank", lambda row: "" if pd.isna(row["rank"]) else str(row["rank"])),
     "samples": ("plant samples", lambda row: str(row["plant_samples"] or "")),
     "finished": (
         "finished",
@@ -37,9 +37,12 @@ REPORT_COLUMNS: dict[str, tuple[str, Text]] = {
     ),
     "regret": (
         "regret %, median [95 %]",
-        lambda row: _percent_cell(row, "regret_median", "regret_wide"),
+        lambda row: _percent_cell(row, "regret_median", "regret_shown"),
     ),
-    "worst": ("worst", lambda row: _percent_cell(row, "regret_worst") if row["runs"] > 1 else ""),
+    "worst": (
+        "worst [95 %]",
+        lambda row: _percent_cell(row, "regret_worst") if row["runs"] > 1 else "",
+    ),
     "iqm": ("IQM [95 %]", lambda row: _percent_cell(row, "regret_iqm") if row["runs"] > 1 else ""),
     "J": ("J, median", lambda row: _number_text(row["J_median"])),
     "J-worst": ("J, worst", lambda row: _number_text(row["J_worst"]) if row["runs"] > 1 else ""),
@@ -47,6 +50,7 @@ REPORT_COLUMNS: dict[str, tuple[str, Text]] = {
     "economic": ("economic cost", lambda row: _number_text(row["economic_cost"])),
     "violation": ("violation", lambda row: f"{row['mean_violation']:.5f}"),
     "violating": ("violating %", lambda row: f"{100 * row['violating_share']:.2f}"),
+    "week": ("violations a week [95 %]", lambda row: _estimate_cell(row, "violations_week")),
     "against": ("against", lambda row: row["against"] if isinstance(row["against"], str) else ""),
     "difference": ("difference % [95 %]", lambda row: _percent_cell(row, "difference")),
     "p": ("p", lambda row: "" if np.isnan(row["difference_p"]) else f"{row['difference_p']:.3f}"),
@@ -132,6 +136,15 @@ def _percent_cell(row: Mapping[str, Any], name: str, ends: str = "", digits: int
     high = float(row.get(f"{ends or name}_high", np.nan))
     interval = None if np.isnan(low) else (low, high)
     return shown(float(row[name]), interval, 100.0, digits)
+
+
+def _estimate_cell(row: Mapping[str, Any], name: str) -> str:
+    """A number with its interval, if any; empty if undefined."""
+    if np.isnan(row[name]):
+        return ""
+    low = float(row[f"{name}_low"])
+    high = float(row[f"{name}_high"])
+    return shown(float(row[name]), None if np.isnan(low) else (low, high), digits=3)
 
 
 def _number_text(value: float) -> str:

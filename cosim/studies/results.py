@@ -28,6 +28,7 @@ from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
 from cosim.studies import figures, operation, report
 from cosim.studies.plan import BASELINES, NAIVE, Study, StudyPlan, plan
+from cosim.studies.ranks import shared_ranks
 from cosim.studies.report import NEAR, PAPER, REPORT_COLUMNS, SHORT_COLUMNS
 from cosim.studies.run import (
     GREEDY,
@@ -180,10 +181,10 @@ class StudyResults(Shown):
             if measured.seed.isna().any() or len(measured) % n_runs[where]:
                 raise StudyError(f"the tables in '{self.folder}' are damaged: {where}")
             shape = (n_runs[where], -1)
-            indicators[where] = {
-                name: measured[name].to_numpy(dtype=np.float64).reshape(shape)
-                for name in INDICATORS
-            }
+            indicators[where] = {}
+            for name in INDICATORS:
+                values = measured[name].to_numpy(dtype=np.float64)
+                indicators[where][name] = values.reshape(shape)
         return indicators
 
     def indicator(self, case: str, scenario: str, name: str = "J") -> Array:
@@ -242,9 +243,11 @@ class StudyResults(Shown):
         for (scenario, case), states in self.state.groupby(WHERE, sort=False):
             indicators = self._indicators[scenario, case]
             for run, row in enumerate(states.to_dict("records")):
-                row.update(_columns("regret", self.regret(case, scenario, [run])))
+                regret = self.regret(case, scenario, [run])
+                row.update(_columns("regret", regret))
                 for name in ("J", *AGGREGATED_MEANS):
-                    row[name] = float(indicators[name][run].mean())
+                    values = indicators[name][run]
+                    row[name] = float(values.mean())
                 # The mean cost of a run that diverged may be NaN.
                 if not np.isfinite(row["J"]):
                     row["J"] = np.inf
@@ -266,9 +269,11 @@ class StudyResults(Shown):
                 if len(self.indicator(case, scenario)):
                     of_scenario.append(self._summary_row(case, scenario))
             of_scenario.sort(key=lambda row: float(row["J_median"]))
-            self._rank(scenario, of_scenario)
+            ranks = self._ranks(scenario, [row["case"] for row in of_scenario])
+            for row in of_scenario:
+                row["rank"] = ranks[row["case"]]
             rows += of_scenario
-        return pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
+        return pd.DataFrame(rows, columns=SUMMARY_COLUMNS).astype({"rank": "Int64"})
 
     def _summary_row(self, case: str, scenario: str) -> dict[str, Any]:
         """A case's row of the summary, but for its rank."""
@@ -331,30 +336,59 @@ class StudyResults(Shown):
         seeds = self.runs_of(case, scenario).training_seed
         other_seeds = self.runs_of(other, scenario).training_seed
         if seeds.notna().all() and other_seeds.notna().all():
-            common = sorted(set(seeds) & set(other_seeds))
-            cost = cost[[list(seeds).index(seed) for seed in common]]
-            other_cost = other_cost[[list(other_seeds).index(seed) for seed in common]]
+            # Runs are in the order of their training seeds.
+            cost = cost[seeds.isin(other_seeds).to_numpy()]
+            other_cost = other_cost[other_seeds.isin(seeds).to_numpy()]
+        # A controller has one row, which is compared with each run.
         pair = np.broadcast_arrays(cost, other_cost)
         return pair[0], pair[1]
 
-    def _rank(self, scenario: str, rows: list[dict[str, Any]]) -> None:
-        """Set the ranks of rows, the lowest median J first.
+    def _ranks(self, scenario: str, cases: Sequence[str]) -> dict[str, int | None]:
+        """Ranks of cases on a scenario, given in the order of their median J."""
 
-        Those that do not differ from the first of their group share its rank.
-        """
-        first = 0
-        for place, row in enumerate(rows):
-            case, leader = row["case"], rows[first]["case"]
+        def is_worse(case: str, leader: str) -> bool:
             cost, leader_cost = self._pairs(case, leader, scenario)
+            # Without a training seed in common nothing is known.
+            if not len(cost):
+                return False
             best = self.reference("optimum", scenario)
             if best is None:
                 best = leader_cost.mean(axis=0)
-            spread_known = not (self._single(case, scenario) or self._single(leader, scenario))
-            if spread_known and len(cost):  # they have a training seed in common
-                interval = paired_difference(cost, leader_cost, best)[1]
-                if interval is not None and interval[0] > 0:
-                    first = place
-            row["rank"] = first + 1
+            interval = paired_difference(cost, leader_cost, best)[1]
+            return interval is not None and interval[0] > 0
+
+        trained_once = [case for case in cases if self._single(case, scenario)]
+        return shared_ranks(cases, trained_once, is_worse)
+
+    def violations_per_week(self, case: str, scenario: str) -> Estimate:
+        """Samples of a week that violate a bound: the median over a case's runs of their mean.
+
+        Args:
+            case: name of the case.
+            scenario: name of the scenario.
+
+        Returns:
+            The number and its interval over training seeds and noise, or over the noise alone of a
+            single run; NaN where the study does not say its sampling time.
+        """
+        share = self.indicator(case, scenario, "violating_share")
+        sampling_time = self._sampling_time(scenario)
+        if sampling_time is None or not share.size:
+            return Estimate(np.nan)
+        per_week = share * operation.WEEK / sampling_time
+        ones = np.ones(per_week.shape[1])
+        interval = two_way(per_week, ones, np.zeros_like(per_week))
+        return Estimate(float(np.median(per_week.mean(axis=1))), interval)
+
+    def _sampling_time(self, scenario: str) -> float | None:
+        """Sampling time in s; None in studies that an earlier version stored."""
+        times: Mapping[str, float] = self.about.get("sampling_times", {})
+        if scenario in times:
+            return times[scenario]
+        in_operation = self.about.get("operation") or {}
+        if scenario in in_operation:
+            return float(in_operation[scenario]["sampling_time"])
+        return None
 
     def regrets(self, case: str, scenario: str) -> Array:
         """Regret (R,) of each run; infinite if J is not finite, NaN if J* is unknown."""
@@ -406,13 +440,34 @@ class StudyResults(Shown):
             StudyError: there is no such column.
         """
         if columns is None:
-            paired = any(case.get("against") for case in self.cases.values())
-            columns = list(REPORT_COLUMNS) if paired else list(REPORT_COLUMNS)[:-3]
+            columns = list(REPORT_COLUMNS)
+            if not any(case.get("against") for case in self.cases.values()):
+                columns = columns[:-3]
+            if self._sampling_time(scenario) is None:
+                columns.remove("week")
         for name in columns:
             if name not in REPORT_COLUMNS:
                 raise StudyError(f"a table has no column '{name}'{instead(name, REPORT_COLUMNS)}")
         rows = self.summary[self.summary.scenario == scenario].to_dict("records")
+        for row in rows:
+            row.update(self._further_intervals(row))
         return report.texts(rows, dict(REPORT_COLUMNS[name] for name in columns))
+
+    def _further_intervals(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """What a printed row shows beside its columns of the summary."""
+        case = row["case"]
+        scenario = row["scenario"]
+        # Of one training the interval is over the noise alone.
+        kind = "regret_median" if self._single(case, scenario) else "regret_wide"
+        runs = self.runs_of(case, scenario)
+        worst = runs.iloc[int(np.argmax(runs.J))]
+        return {
+            "regret_shown_low": row[f"{kind}_low"],
+            "regret_shown_high": row[f"{kind}_high"],
+            "regret_worst_low": worst.regret_low,
+            "regret_worst_high": worst.regret_high,
+            **_columns("violations_week", self.violations_per_week(case, scenario)),
+        }
 
     def table(self, scenario: str | None = None) -> str:
         """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
@@ -456,12 +511,15 @@ class StudyResults(Shown):
         rows = []
         trained = [name for name, case in self.cases.items() if case["trained"]]
         for scenario, case in product(self.scenarios, trained):
-            bases = [self._indicators.get((scenario, name)) for name in PAPER]
             indicators = self._indicators.get((scenario, case))
-            there = [base for base in bases if base is not None]
-            if indicators is None or len(there) < len(bases):
+            bases = []
+            for name in PAPER:
+                if (scenario, name) in self._indicators:
+                    bases.append(self._indicators[scenario, name])
+            if indicators is None or len(bases) < len(PAPER):
                 continue
-            rows.append([scenario, case, *_gains_over_baselines(indicators, there)])
+            gains = _gains_over_baselines(indicators, bases)
+            rows.append([scenario, case, *gains])
         said = "the paper's text states about 21 % over (a) and 15 % over (b)"
         header = (
             "scenario", "case", "J(b)/J(a)", "J, median", "gain over (a) %", "gain over (b) %",
@@ -475,10 +533,13 @@ class StudyResults(Shown):
         None is the first scenario's regret. Raises StudyError for another name, and where there is
         nothing to draw.
         """
-        names = [f"{kind}-{scenario}" for scenario in self.scenarios for kind in self._makers]
-        name = name or f"regret-{self.scenarios[0]}"
-        kind, _, scenario = name.partition("-")
-        drawn = self._makers[kind](scenario) if name in names else None
+        if name is None:
+            name = f"regret-{self.scenarios[0]}"
+        names = [f"{kind}-{where}" for where, kind in product(self.scenarios, self._makers)]
+        drawn = None
+        if name in names:
+            kind, _, scenario = name.partition("-")
+            drawn = self._makers[kind](scenario)
         if drawn is None:
             raise StudyError(f"this study draws no figure '{name}'{instead(name, names)}")
         return drawn
@@ -501,8 +562,9 @@ class StudyResults(Shown):
         for scenario in self.scenarios:
             drawn = []
             for kind, maker in self._makers.items():
-                if (made := maker(scenario)) is not None:
-                    drawn.append((f"{kind}-{folder_name(scenario)}", made))
+                figure = maker(scenario)
+                if figure is not None:
+                    drawn.append((f"{kind}-{folder_name(scenario)}", figure))
             names[scenario] = save_set(drawn, folder, formats)
         return names
 
@@ -536,18 +598,20 @@ class StudyResults(Shown):
     def _curves(self, scenario: str) -> Figure | None:
         """Learning curves; None if no training was evaluated more than once."""
         rows = self.curves[self.curves.scenario == scenario]
-        trained = rows[rows.training_seed.notna()]
-        greedy = trained.dropna(subset="greedy_J").groupby(RUN_KEYS).greedy_J
+        is_training = rows.training_seed.notna()
+        trained = rows[is_training]
+        evaluated = trained.dropna(subset="greedy_J").groupby(RUN_KEYS).greedy_J
         learned = trained[~trained.case.isin(self.baselines)].groupby("case", sort=False)
-        if not (greedy.size() > 1).any() or not len(learned):
+        if not (evaluated.size() > 1).any() or not len(learned):
             return None
-        controllers = rows[rows.training_seed.isna()].set_index("case").greedy_J
+        controllers = rows[~is_training].set_index("case").greedy_J
         best = float(controllers.get(self.about["optimum"].get(scenario), np.nan))
         is_known = bool(np.isfinite(best))
         curves = {}
         for case, log in learned:
             curves[str(case)] = figures.learning_curve(log, best if is_known else None)
-        levels = self._levels(scenario, controllers, greedy.last().groupby("case").median())
+        at_the_end = evaluated.last().groupby("case").median()
+        levels = self._levels(scenario, controllers, at_the_end)
         if is_known:
             levels[:] = 100 * statistics.regrets(levels.to_numpy(), best)
         return figures.curves_figure(
@@ -566,20 +630,22 @@ class StudyResults(Shown):
             trained: median greedy cost of each trained case at its end, by name.
         """
         costs = pd.concat([controllers, trained])
-        optimum = self.about["optimum"].get(scenario)
-        costs = costs[costs.index.isin(self.baselines) & (costs.index != optimum)]
-        costs = costs[np.isfinite(costs)]
-        # Naive stays: it is where the curves begin.
-        first = self.about["naive"].get(scenario)
-        in_order = sorted(costs.index, key=lambda name: (name != first, costs[name]))
-        return costs[in_order[:MOST_LEVELS]]
+        # The optimum is where a regret is 0, and no line.
+        is_baseline = costs.index.isin(self.baselines)
+        is_optimum = costs.index == self.about["optimum"].get(scenario)
+        costs = costs[is_baseline & ~is_optimum & np.isfinite(costs)]
+        costs = costs.sort_values(kind="stable")
+        # Naive is kept, be it the worst: it is where the curves begin.
+        naive = self.about["naive"].get(scenario)
+        names = [name for name in costs.index if name == naive]
+        names += [name for name in costs.index if name != naive]
+        return costs[names[:MOST_LEVELS]]
 
     def _operation_result(self, scenario: str) -> operation.OperationResult:
         """Regrets of the runs in operation on a scenario."""
         runs = read_table(self.folder / OPERATION, needed=["samples"])
-        runs = runs.reindex(
-            columns=MEASURED_COLUMNS[OPERATION]
-        )  # an older table lacks the latest ones
+        # A table that an earlier version stored lacks the latest columns.
+        runs = runs.reindex(columns=MEASURED_COLUMNS[OPERATION])
         greedy = read_table(self.folder / GREEDY, MEASURED_COLUMNS[GREEDY])
         return operation.operation_result(
             runs[runs.scenario == scenario],
@@ -596,11 +662,14 @@ class StudyResults(Shown):
         path = self.folder / TIMING
         if not path.is_file():
             return {}
-        clock = read_table(path, needed=["run"]).set_index("run").training_seconds
+        clock = read_table(path, needed=["run"]).set_index("run")
         last = self.about["operation"][scenario]["columns"][-1]
-        runs = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
-        names = runs.case + " on " + scenario + ", seed " + runs.training_seed.astype(str)
-        seconds = (names + f", sample {last}").map(clock)
+        is_training = self.state.training_seed.notna()
+        runs = self.state[(self.state.scenario == scenario) & is_training]
+        # The table names a run as `Run` does, and the mark behind it.
+        seeds = runs.training_seed.astype(str)
+        names = runs.case + f" on {scenario}, seed " + seeds + f", sample {last}"
+        seconds = names.map(clock.training_seconds)
         return dict(seconds.groupby(runs.case).median())
 
     def _operation(self, scenario: str) -> Figure | None:
@@ -615,15 +684,18 @@ class StudyResults(Shown):
 
     def report(self) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
-        page = self._page(self.draw(self.folder / report.FOLDER))
+        folder = self.folder / report.FOLDER
+        drawn = self.draw(folder)
+        page = self._page(drawn)
 
         def picture(name: str) -> dict[str, str] | None:
-            path = self.folder / report.FOLDER / f"{name}.svg"
+            path = folder / f"{name}.svg"
             # Those of a stored study's single runs are there once `cosim results draw` drew them.
             return report.image(path) if path.is_file() else None
 
         for name in (report.MARKDOWN, report.PAGE):
-            write_atomically(self.folder / name, report.rendered(name, **page, picture=picture))
+            text = report.rendered(name, **page, picture=picture)
+            write_atomically(self.folder / name, text)
         return self.folder / report.PAGE
 
     def _page(self, drawn: Mapping[str, list[str]]) -> dict[str, Any]:
@@ -671,10 +743,14 @@ class StudyResults(Shown):
         rows = self.evaluation[self.evaluation.scenario == scenario]
         if rows.empty:
             return "No run is finished."
+        note = (
+            f"Table and regret: {rows.seed.nunique()} noise seeds × {rows.steps.iloc[0]} samples."
+        )
+        if scenario not in self.about["curves"]:
+            return note
         seeds, steps = self.about["curves"][scenario]
         return (
-            f"Table and regret: {rows.seed.nunique()} noise seeds × {rows.steps.iloc[0]} "
-            f"samples. Learning curves: {seeds} other seeds × {steps} samples. Regrets of a case "
+            f"{note} Learning curves: {seeds} other seeds × {steps} samples. Regrets of a case "
             "differ between the two."
         )
 
@@ -694,20 +770,22 @@ def _gains_over_baselines(
         indicators: of the case, (R, S) each.
         bases: indicators of the controllers (a) and (b), (1, S) each.
     """
+    naive, tuned = bases
     cost = indicators["J"].mean(axis=1)
+    # Of an even number the lower one of both middle runs.
     middle = np.argsort(cost, kind="stable")[(len(cost) - 1) // 2]
-    gains = []
+    ratio = tuned["J"].mean() / naive["J"].mean()
+    cells = [f"{ratio:.3f}", shown(float(cost[middle]), digits=6)]
     for name in ("J", "economic_cost"):
         for base in bases:
-            gains.append(statistics.gain(indicators[name][middle], base[name][0]))
+            gain = statistics.gain(indicators[name][middle], base[name][0])
+            cells.append(shown(gain.value, gain.interval, 100.0, 3))
     agrees = []
-    for letter, gain, of_the_paper in zip("ab", gains[:2], PAPER.values(), strict=True):
+    for letter, base, of_the_paper in zip("ab", bases, PAPER.values(), strict=True):
+        gain = statistics.gain(indicators["J"][middle], base["J"][0])
         if abs(100 * gain.value - of_the_paper) <= NEAR:
             agrees.append(f"({letter})")
-    ratio = bases[1]["J"].mean() / bases[0]["J"].mean()
-    texts = [shown(gain.value, gain.interval, 100.0, 3) for gain in gains]
-    median = shown(float(cost[middle]), digits=6)
-    return [f"{ratio:.3f}", median, *texts, " and ".join(agrees)]
+    return [*cells, " and ".join(agrees)]
 
 
 def _in_the_studys_order(plan: StudyPlan, stores: Iterable[RunStore]) -> list[RunStore]:
@@ -779,8 +857,10 @@ def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
     for store in stores:
         clock = store.about.get("timing", {})
         name = str(store.run)
-        rows.append({"run": name, "training_seconds": float(clock.get("wall_seconds", 0.0))})
-        for mark, seconds in clock.get("processor_seconds", {}).items():
+        wall_seconds = float(clock.get("wall_seconds", 0.0))
+        rows.append({"run": name, "training_seconds": wall_seconds})
+        at_marks: Mapping[str, float] = clock.get("processor_seconds", {})
+        for mark, seconds in at_marks.items():
             rows.append({"run": f"{name}, sample {mark}", "training_seconds": float(seconds)})
     return pd.DataFrame(rows, columns=["run", "training_seconds"])
 
@@ -796,7 +876,7 @@ def document(plan: StudyPlan) -> dict[str, Any]:
         about_case["against"] = definition.counterpart(case)
         cases.append(about_case)
     curves = {}
-    for name in scenarios:
+    for name in scenarios if definition.has_curves else ():
         noise = definition.held_out(name)
         curves[name] = [len(noise.seeds), noise.steps]
     about = {
@@ -810,6 +890,9 @@ def document(plan: StudyPlan) -> dict[str, Any]:
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.named(NAIVE)),
         "curves": curves,
+        "sampling_times": {
+            name: scenario.sampling_time for name, scenario in definition.scenarios.items()
+        },
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
         "made_with": dict(plan.provenance) | {"commit": report.commit()},

@@ -15,7 +15,7 @@ import json
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +26,7 @@ from cosim.core.files import read_json, temporary_folder, write_atomically
 from cosim.core.modules import UNKNOWN
 from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario
+from cosim.core.training_options import TrainingOptions
 from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.identity import changed, file_hash
 from cosim.measurement import Factory, Measured, MeasureItem, Noise
@@ -82,9 +83,11 @@ def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = 
     import pandas as pd  # noqa: PLC0415
 
     try:
+        # As texts: an empty cell alone is missing, not a case called NA.
         texts = pd.read_csv(path, dtype="string", keep_default_na=False, na_values=[""])
-        wanted = dict.fromkeys([*(columns or texts), *needed])
-        return typed(texts[list(wanted)])
+        chosen = columns or list(texts)
+        further = [name for name in needed if name not in chosen]
+        return typed(texts[[*chosen, *further]])
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise StudyError(f"'{path}' is missing or damaged: {error}") from None
 
@@ -114,50 +117,32 @@ class TrainingJob:
     Attributes:
         algorithm: a registered name, or `module:Class`.
         samples: plant samples.
-        seed: of noise and exploration.
-        nmpc: the NMPC that carries θ, `rti` or `converged`.
-        start: where θ starts: a name, or a θ file.
-        theta: text of that θ file; None for a start with a name.
-        settings: the algorithm's hyperparameters by name.
-        options: further options of the training loop by name.
+        options: seed, start and all else that is chosen of it.
+        theta: text of the θ file where θ starts; None for a start with a name.
+        settings: the algorithm's hyperparameters by name, as its configuration takes them.
         marks: in operation, the samples after which θ is evaluated; else empty.
     """
 
     algorithm: str
     samples: int
-    seed: int
-    nmpc: str
-    start: str
+    options: TrainingOptions
     theta: str | None
     settings: Mapping[str, object]
-    options: Mapping[str, int | float | None]
     marks: tuple[int, ...] = ()
 
     def make_run(self, scenario: Scenario) -> TrainingRun:
         """The training on a scenario; raises what is wrong with it."""
         from learning.training_run import make_run  # noqa: PLC0415
 
-        # What an option may be is checked there.
-        options: dict[str, Any] = dict(self.options)
-        return make_run(
-            self.algorithm,
-            scenario,
-            self.samples,
-            self.settings,
-            seed=self.seed,
-            start=self.start,
-            controller=self.nmpc,
-            **options,
-        )
+        return make_run(self.algorithm, scenario, self.samples, self.settings, self.options)
 
     def facts(self, start: str) -> dict[str, Any]:
         """What the training's result depends on, with the start as the study's file names it."""
-        named = {"seed": self.seed, "controller": self.nmpc, "start": start}
         return {
             "algorithm": self.algorithm,
             "samples": self.samples,
             "settings": dict(self.settings),
-            "options": named | dict(self.options),
+            "options": asdict(replace(self.options, start=start)),
         }
 
 
@@ -215,7 +200,7 @@ class Run:
     def source(self, parameters: str) -> ControllerSource | Factory:
         """The controller; of a training the NMPC of the θ that a TOML text holds."""
         if self.training is not None:
-            return ControllerSource(PARAMETERS, parameters, self.training.nmpc)
+            return ControllerSource(PARAMETERS, parameters, self.training.options.controller)
         assert self.controller is not None
         return self.controller
 
@@ -286,7 +271,8 @@ class TrainItem(Item[Trained]):
             if training.theta is not None:
                 start = folder / "start.toml"
                 start.write_text(training.theta, "utf-8")
-                training = replace(training, start=str(start))
+                options = replace(training.options, start=str(start))
+                training = replace(training, options=options)
             run = training.make_run(self.conditions.scenario)
             if training.marks:
                 trained = _train_in_operation(run, training.marks)
@@ -570,13 +556,16 @@ class RunStore:
 
     def seal(self) -> None:
         """Write the hashes of a finished run's files to run.json."""
-        trained = self.run.training is None or bool(self.status)
-        self.complete = trained and not any(self.missing(file) for file in self.run.noise)
-        if self.complete:
-            self.flush()
-            files = {path.name: file_hash(path) for path in self._files() if path.name != TIMING}
-            if self.about.get("files") != files:
-                self._note(files=files)
+        is_trained = self.run.training is None or bool(self.status)
+        lacks_noise = any(self.missing(file) for file in self.run.noise)
+        self.complete = is_trained and not lacks_noise
+        if not self.complete:
+            return
+        self.flush()
+        # Times differ from run to run: they are no result.
+        hashes = {path.name: file_hash(path) for path in self._files() if path.name != TIMING}
+        if self.about.get("files") != hashes:
+            self._note(files=hashes)
 
     def _unseal(self) -> None:
         """Remove the hashes before more is written, but those of the training's own files."""

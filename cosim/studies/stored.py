@@ -97,18 +97,14 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     for path in sorted(out.rglob("*")):
         relative = path.relative_to(out)
         kept = path.suffix in STORED_SUFFIXES or path.name == ABOUT
-        if (
-            not path.is_file()
-            or relative.parts[0] == RUNS_FOLDER
-            or path.name == TIMING
-            or not kept
-        ):
+        is_of_a_run = relative.parts[0] == RUNS_FOLDER
+        if not path.is_file() or not kept or is_of_a_run or path.name == TIMING:
             continue
         content = path.read_bytes()
-        if path.suffix == ".csv":  # a last bit is no change
-            content = frame_csv(
-                pd.read_csv(path, dtype=str, na_filter=False).map(_rounded_cell)
-            ).encode()
+        if path.suffix == ".csv":
+            # A last bit is no change.
+            table = pd.read_csv(path, dtype=str, na_filter=False).map(_rounded_cell)
+            content = frame_csv(table).encode()
         if len(content) > LARGEST:
             left_out.append(relative.as_posix())
             continue
@@ -276,11 +272,16 @@ def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
 def _theta_table(path: Path) -> pd.DataFrame:
     """A θ file as a table of one row: its hash, and each number of θ under its name in a log."""
     document = read_toml(path, f"'{path}'", ResultsError)
-    row = {"schema": str(document.get("schema", "")), "hash": str(document.get("hash", ""))}
-    for block, values in document.get("theta", {}).items():
+    row: dict[str, str] = {}
+    row["schema"] = str(document.get("schema", ""))
+    row["hash"] = str(document.get("hash", ""))
+    blocks: Mapping[str, object] = document.get("theta", {})
+    for block, values in blocks.items():
         array = np.asarray(values, dtype=np.float64)
         for index in np.ndindex(array.shape):
-            place = f"[{','.join(map(str, index))}]" if index else ""
+            # A block that is one number has no index.
+            numbers = ",".join(str(number) for number in index)
+            place = f"[{numbers}]" if index else ""
             row[f"theta {block}{place}"] = repr(float(array[index]))
     return pd.DataFrame([row])
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from controllers.factories import naive
 from cosim import Decision, FmuPlant, Scenario, Study, evaluate, simulate, train
 from cosim.core.errors import CosimError
+from cosim.core.training_options import TrainingOptions
 from cosim.evaluation import judge
 from learning.training_run import make_run
 from tests.helpers.loop import Proportional
@@ -103,7 +104,8 @@ OPTIONS = ("seed", "start", "controller", "log_every", "divergence", "settings",
 @given(st.sampled_from(OPTIONS), ANY)
 def test_a_training_with_any_option(name, value):
     hyperparameters, options = (value, {}) if name == "settings" else (None, {name: value})
-    accepted(lambda: make_run("q-learning", PAPER, 10, hyperparameters, **{"seed": 0} | options))
+    options = TrainingOptions(**options)
+    accepted(lambda: make_run("q-learning", PAPER, 10, hyperparameters, options))
 
 
 def test_a_training_seed_is_no_held_out_one():

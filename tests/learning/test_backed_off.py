@@ -7,6 +7,7 @@ from controllers.economic import tune
 from controllers.rti import RtiNmpc
 from cosim.core.plugins import build_controller
 from cosim.core.simulation import simulate
+from cosim.core.training_options import TrainingOptions
 from cosim.plant import FmuPlant
 from learning import training_run
 from learning.backed_off import add_reserve, back_off
@@ -40,7 +41,7 @@ def test_the_plant_says_nothing_of_it(scenario, tuned):
 
 def test_a_training_starts_with_it(scenario, monkeypatch):
     monkeypatch.setattr(training_run, "back_off", partial(back_off, samples=1000))
-    run = make_run("q-learning", scenario, 1000, start="backed-off")
+    run = make_run("q-learning", scenario, 1000, options=TrainingOptions(start="backed-off"))
     start = run.starting_parameters()
     assert start["x_l"][0] > 25.0 and "w_sigma" in start.blocks
     assert np.array_equal(start.theta, run.starting_parameters().theta)

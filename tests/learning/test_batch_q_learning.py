@@ -18,7 +18,7 @@ def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenar
     offsets = {}
     for measured in (True, False):
         configuration = algorithm.Configuration.from_dict(settings | {"measure_offset": measured})
-        run = TrainingRun("batch-q-learning", scenario, 120, 3, configuration, start="tuned")
+        run = TrainingRun("batch-q-learning", scenario, 120, configuration, seed=3, start="tuned")
         with FmuPlant(scenario) as plant:
             learner = begin_training(run, algorithm, plant)
             updates = [learner.advance()[1] is not None for _ in range(120)]

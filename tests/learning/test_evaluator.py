@@ -4,9 +4,9 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from cosim.core.simulation import indicators_of
+from cosim.core.training_options import HELD_OUT
 from learning.evaluator import Evaluator
 from learning.log import METRICS
-from learning.training_run import HELD_OUT
 from tests.helpers.training import make_run
 
 

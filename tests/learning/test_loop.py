@@ -10,13 +10,14 @@ from controllers.errors import QpError
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant, simulate
 from cosim.core.simulation import spawn_seeds
+from cosim.core.training_options import HELD_OUT
 from learning import QLearning
 from learning.algorithm import Update
 from learning.errors import PrivilegeError
 from learning.exploration import Strategy
 from learning.loop import PlantInOperation, TrainingLoop
 from learning.training import run_training
-from learning.training_run import HELD_OUT, TrainingRun, begin_training, starting_parameters
+from learning.training_run import TrainingRun, begin_training, starting_parameters
 
 
 class Idle:
@@ -100,7 +101,7 @@ def test_a_failure_repeats_the_action_and_teaches_nothing(plant, problem, parame
 
 def make_run(scenario, seed=3):
     configuration = QLearning.Configuration.from_dict({"prior_samples": 20, "step_every": 20})
-    return TrainingRun("q-learning", scenario, 100, seed, configuration)
+    return TrainingRun("q-learning", scenario, 100, configuration, seed=seed)
 
 
 def test_an_update_is_reported_where_theta_moves(plant):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from controllers.theta import Parameters, ThetaBlocks
+from cosim.core.training_options import TrainingOptions
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
@@ -29,7 +30,7 @@ def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(proble
 def test_what_is_not_given_of_log_evaluation_and_checkpoint_fits_the_rest(
     scenario, given, expected
 ):
-    run = make_run("q-learning", scenario, 100, **given)
+    run = make_run("q-learning", scenario, 100, options=TrainingOptions(**given))
     assert (run.log_every, run.evaluate_every, run.checkpoint_every) == expected
 
 

@@ -186,3 +186,16 @@ def test_p_is_uniform_where_nothing_differs(runs, monkeypatch):
     for p in np.unique(found):
         spread = np.sqrt(p * (1 - p) / 2000)
         assert np.mean(np.array(found) <= p) == pytest.approx(p, abs=4.5 * spread + 1e-3)
+
+
+def test_the_median_over_runs_has_the_interval_of_runs_drawn_anew(rng):
+    values = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    estimate = statistics.median_over_runs(values)
+    assert estimate.value == 4.0
+    drawn = np.median(rng.choice(values, size=(100_000, 5)), axis=1)
+    assert estimate.interval == tuple(np.quantile(drawn, [0.025, 0.975], method="nearest"))
+
+
+def test_one_run_has_no_interval_and_a_diverged_one_an_infinite_end():
+    assert statistics.median_over_runs(np.array([3.0])) == (3.0, None)
+    assert statistics.median_over_runs(np.array([3.0, np.inf, 3.0])) == (3.0, (3.0, np.inf))

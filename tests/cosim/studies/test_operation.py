@@ -1,7 +1,7 @@
 import numpy as np
 import pandas as pd
 
-from cosim import study
+from cosim import Study, study
 from cosim.studies.operation import (
     OPERATION_METRICS,
     SHIFT,
@@ -10,7 +10,7 @@ from cosim.studies.operation import (
     operation_result,
     operation_tables,
 )
-from tests.helpers.toy_study import SCENARIO
+from tests.helpers.toy_study import GROW, SCENARIO
 
 
 def test_noise_alone_makes_no_shift_dearer_and_a_dearer_one_is_found(rng):
@@ -44,6 +44,33 @@ def test_a_study_in_operation_keeps_a_log_without_a_picture_of_it(tmp_path):
     document |= {"evaluation": {"seeds": 1, "steps": 20}, "curves": {"seeds": 2, "steps": 10}}
     study(document | {"logs": ["h"]}, tmp_path)
     assert (tmp_path / "logs" / "paper-h.csv").is_file()
+
+
+def test_in_operation_theta_is_evaluated_on_the_noise_of_the_comparison(tmp_path):
+    """Without [curves]. θ at the last time is the final one, on the same plant and noise."""
+    document = {"schema": 1, "name": "one", "scenarios": ["paper"], "operation": {"hours": [1, 2]}}
+    document["scenario"] = [SCENARIO]
+    document["training_seeds"] = {"count": 1}
+    document["evaluation"] = {"first_seed": 50, "seeds": 2, "steps": 20, "burn_in": 5}
+    document["case"] = [{"name": "grow", "algorithm": GROW}]
+    results = study(document, tmp_path)
+    evaluated = results.evaluation[results.evaluation.case == "grow"]
+    greedy = pd.read_csv(tmp_path / "greedy.csv")
+    greedy = greedy[greedy.case == "grow"]
+    at_the_end = greedy[greedy.samples == 120]
+    assert list(at_the_end.seed) == [50, 51]
+    assert list(at_the_end.J) == list(evaluated.J)
+    assert list(greedy[greedy.samples == 60].J) != list(evaluated.J)
+    assert "Learning curves" not in results.report().read_text()
+
+
+def test_with_a_table_curves_theta_in_operation_meets_its_noise_after_the_same_burn_in():
+    document = {"schema": 1, "name": "one", "scenarios": ["paper"], "operation": {"hours": [1]}}
+    document["evaluation"] = {"first_seed": 50, "seeds": 2, "steps": 20, "burn_in": 5}
+    document["case"] = [{"controller": "naive"}]
+    document["curves"] = {"seeds": 3, "steps": 10}
+    noise = Study.from_dict(document).noise_at_marks("paper")
+    assert (len(noise.seeds), noise.steps, noise.burn_in) == (3, 10, 5)
 
 
 def test_cases_with_other_training_seeds_are_compared_on_those_that_both_have():

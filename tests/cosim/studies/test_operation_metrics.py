@@ -8,6 +8,7 @@ from scipy import stats
 from controllers.factories import nmpc
 from cosim import FmuPlant, study
 from cosim.core.simulation import spawn_seeds
+from cosim.core.training_options import TrainingOptions
 from cosim.studies.operation import (
     OPERATION_METRICS,
     SHIFT,
@@ -176,15 +177,40 @@ def test_the_tables_show_medians_and_worst_runs_in_per_cent(found):
         for title, _, rows in operation_tables(found, "paper", layout, {"a": "b", "b": None}, {})
     }
     regret, run, took, shifts, paired = by_title.values()
-    assert regret[0] == ["a", "30.0 (50.0)"]  # 10 % and 50 %
-    assert run[0] == ["a", "22.5 (25.0)"]  # 20 % and 25 %
-    # case, runs, first change, violating %, worst window %, updates, model samples, seconds
-    assert took[0] == ["a", "2", "", "37.50", "125.0", "", "", ""]
+    # 10 % and 50 %; at the ends one run alone, 2 of 21 and 10 of 19, J* of one noise seed alone.
+    assert regret[0] == ["a", "2", "30.0 [9.5, 52.6] (50.0)"]
+    assert regret[1][:2] == ["b", "1"]
+    assert regret[1][2].startswith("3.75 [")
+    assert run[0] == ["a", "22.5 [20.0, 25.0] (25.0)"]  # 20 % and 25 %
+    # case, runs, first change, violating %, of the 10 080 samples of a week, worst window %,
+    # updates, model samples, seconds
+    assert took[0] == ["a", "2", "", "37.50", "3780 [2520, 5040]", "125.0", "", "", ""]
+    assert took[1][4] == "0 [0, 0]"
     assert shifts[0] == ["a", "2", "1 (2)", "30.00 (50.00)"]
     # J of a less that of b, a pair a training seed: 1.5 and 9 of 20
     assert paired[0][0] == "a − b"
     assert paired[0][1].startswith("26.2 [")
     assert paired[0][1].endswith("p 0.50")  # two pairs of the same sign, two-sided
+
+
+def test_what_was_trained_once_has_no_rank_at_the_end_and_what_does_not_differ_shares_one():
+    cases = {
+        "once": [[1.0, 1.0]],
+        "a": [[11.0, 12.0], [12.0, 13.0]],
+        "b": [[11.5, 12.0], [11.7, 13]],
+    }
+    rows = [("optimal", None, 480, 7, 10.0), ("optimal", None, 480, 8, 10.0)]
+    run = []
+    for name, costs in cases.items():
+        for seed, cost in enumerate(costs):
+            rows += [(name, seed, 480, 7, cost[0]), (name, seed, 480, 8, cost[1])]
+            run.append((name, seed, 480, 11.0, {}))
+    result = operation_result(lives(*run), greedy(*rows), "optimal")
+    title, header, table = next(
+        operation_tables(result, "paper", OperationLayout(60, [480]), {}, {})
+    )
+    assert "median [95 %] (worst)" in title and header[1] == "rank at the end"
+    assert {row[0]: row[1] for row in table} == {"once": "", "a": "1", "b": "1"}
 
 
 def in_operation(tmp_path, **settings):
@@ -214,7 +240,7 @@ def test_the_first_change_counts_the_samples_before_it_and_their_cost_is_the_sta
 def start_in_closed_loop(samples, seed):
     """Costs of θ as it starts, and whether a bound is violated, in a loop of this test's own."""
     scenario = toy_scenario()
-    run = make_run("fixed", scenario, samples, seed=seed)
+    run = make_run("fixed", scenario, samples, options=TrainingOptions(seed=seed))
     controller = nmpc(scenario, run.starting_parameters(), "rti")
     costs, violating = [], []
     with FmuPlant(scenario) as plant:

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from cosim import StudyResults
+from cosim import Study, StudyResults
 from cosim.cli.main import app
+from cosim.core.training_options import HELD_OUT
 from cosim.studies.run import read_table
 from cosim.studies.stored import stored_studies
 
@@ -75,6 +76,38 @@ def test_every_stored_study_is_a_valid_study_that_can_be_planned():
         "gate",
         "regression",
     ]
+
+
+FEW_ON_PURPOSE = {
+    "before-after": "pictures of two runs",
+    "converged": "a converged NMPC takes a thousand times as long",
+    "quick": "it says itself that it ranks nothing",
+    "reproduce": "minutes of a user's time",
+    "reproduce-full": "it evaluates a converged NMPC, too",
+}
+"""Studies with fewer noise seeds than figures need that rank cases."""
+
+
+def test_each_study_has_noise_of_its_own_that_no_training_meets_and_enough_of_it():
+    """A θ's mean cost is of rare events: noise that all studies share errs in all in one way."""
+    used = {}
+    for name, table in stored_studies(STORED).items():
+        # Those hold digits and rank nothing; their tables are of the noise that they have.
+        if table.check:
+            continue
+        study = Study.load(STORED / f"{name}.toml")
+        trained = {seed for case in study.cases for seed in case.training_seeds}
+        assert max(trained, default=0) < HELD_OUT
+        seeds = set()
+        for scenario in study.scenarios:
+            noise = study.noise(scenario)
+            seeds |= set(noise.seeds)
+            if name not in FEW_ON_PURPOSE:
+                assert len(noise.seeds) >= 30 and len(noise.seeds) * noise.steps >= 250_000, name
+                assert not study.marks(scenario) or study.noise_at_marks(scenario) == noise
+        assert min(seeds) > 2 * HELD_OUT
+        for seed in seeds:
+            assert used.setdefault(seed, name) == name, f"{name} and {used[seed]} share {seed}"
 
 
 @pytest.mark.slow

@@ -167,10 +167,54 @@ def test_a_case_that_does_not_differ_from_the_leader_shares_its_rank():
     assert ranks == {"optimal": 1, "a": 2, "b": 2, "naive": 4}
 
 
-def test_one_training_has_no_rank_of_its_own():
-    """Its spread is unknown, so that it is not said to be worse."""
-    table = results({"a": [[12.0, 12.0]], "b": [[15.0, 15.0]]}, naive=90.0).summary
-    assert dict(zip(table.case, table["rank"], strict=True))["b"] == 1
+def test_what_was_trained_once_has_no_rank_and_moves_no_other_case_s():
+    once = [[9.0, 9.0]]  # it seems to be the best, and its spread is unknown
+    a = [[12.0, 12.1], [12.2, 12.0]]
+    b = [[15.0, 15.1], [15.2, 15.0]]
+    table = results({"once": once, "a": a, "b": b}, naive=90.0).summary
+    assert list(table.case) == ["once", "optimal", "a", "b", "naive"]
+    assert pd.isna(table["rank"].iloc[0])
+    assert list(table["rank"].iloc[1:]) == [1, 2, 3, 4]
+
+
+def printed(study, case):
+    """Cells of a case's row of the printed table, by their headings."""
+    header, rows = study.lines("paper")
+    (row,) = [row for row in rows if row[0] == case]
+    return dict(zip(header, row, strict=True))
+
+
+def test_a_printed_regret_has_its_interval_over_trainings_and_noise_or_over_noise_alone():
+    study = results({"four": FOUR, "once": [[11.0, 13.0]]})
+    row = row_of(study.summary, "four")
+    low, high = 100 * row["regret_wide_low"], 100 * row["regret_wide_high"]
+    cells = printed(study, "four")
+    assert cells["regret %, median [95 %]"] == f"25.0 [{low:.1f}, {high:.1f}]"
+    # Regrets 0.3 and 0.9 with the two noise seeds of the worst run.
+    half = stats.t.ppf(0.975, 1) * stats.sem([30.0, 90.0])
+    assert cells["worst [95 %]"] == f"60.0 [{60 - half:.1f}, {60 + half:.1f}]"
+    half = stats.t.ppf(0.975, 1) * stats.sem([10.0, 30.0])
+    once = printed(study, "once")
+    assert once["regret %, median [95 %]"] == f"20.0 [{20 - half:.1f}, {20 + half:.1f}]"
+    assert (once["rank"], once["worst [95 %]"]) == ("", "")
+
+
+def test_violations_a_week_are_the_share_of_its_samples_with_an_interval_over_both():
+    """10 080 samples of a minute, of which runs 0 to 3 violate 0, 1, 2 and 3 %."""
+    study = results({"four": FOUR, "once": [[11.0, 13.0]]})
+    study.about["sampling_times"] = {"paper": 60.0}
+    estimate = study.violations_per_week("four", "paper")
+    assert estimate.value == pytest.approx(151.2)  # the median of 0, 100.8, 201.6 and 302.4
+    # The share is the same with each noise seed: only the runs spread it.
+    drawn = np.random.default_rng(1).integers(4, size=(4, 200_000))
+    ends = np.quantile(np.median(100.8 * drawn, axis=0), [0.025, 0.975])
+    assert estimate.interval == pytest.approx(ends, abs=51.0)
+    assert printed(study, "four")["violations a week [95 %]"].startswith("151 [")
+    assert printed(study, "once")["violations a week [95 %]"] == "0 [0, 0]"
+
+
+def test_a_study_that_does_not_say_its_sampling_time_has_no_violations_a_week():
+    assert "violations a week [95 %]" not in results({"four": FOUR}).lines("paper")[0]
 
 
 SIX = np.array([0.5, -0.2, 0.9, 0.4, 0.7, -0.1])

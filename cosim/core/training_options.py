@@ -1,0 +1,105 @@
+"""`TrainingOptions`: what one may choose of a training, described once for Python, files, commands.
+
+It stands in the ground, since the command line shows it without importing a rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from inspect import Parameter, signature
+from typing import Any, TypeVar, get_type_hints
+
+HELD_OUT = 1_000_000
+"""First of the held-out seeds; training seeds stay below."""
+MOST = 100_000_000
+"""Samples of the longest run."""
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Range:
+    """Least and largest value of an option that is a number; None where there is no limit."""
+
+    least: float
+    most: float | None = None
+
+
+def _within(least: float, most: float | None, default: float | None) -> Any:
+    """A field of numbers from `least` to `most`."""
+    return field(default=default, metadata={"range": Range(least, most)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """What one may choose of a training beside its rule, its scenario and its samples.
+
+    Attributes:
+        seed: Seed of noise and exploration.
+        start: Where θ starts: naive, tuned, backed-off, cautious or a parameters file.
+        controller: What carries θ: rti or converged.
+        log_every: Samples per row of the log; default: 1000, or what fits the next.
+        evaluate_every: Samples per greedy evaluation; default: about 5000.
+        checkpoint_every: Samples per checkpoint; default: about 5000.
+        evaluation_seeds: Held-out runs per evaluation.
+        evaluation_steps: Samples of each of them.
+        divergence: Times the start's J at which a run has diverged.
+        rest_after: Samples after which θ stays and nothing explores; default: never.
+    """
+
+    seed: int = _within(0, HELD_OUT - 1, 0)
+    start: str = "naive"
+    controller: str = "rti"
+    log_every: int | None = _within(1, MOST, None)
+    evaluate_every: int | None = _within(1, MOST, None)
+    checkpoint_every: int | None = _within(1, MOST, None)
+    evaluation_seeds: int = _within(1, HELD_OUT, 4)
+    evaluation_steps: int = _within(1, MOST, 500)
+    divergence: float = _within(1, None, 1.5)
+    rest_after: int | None = _within(1, MOST, None)
+
+
+OPTION_NAMES = tuple(option.name for option in fields(TrainingOptions))
+
+
+def option_ranges() -> dict[str, Range]:
+    """Ranges of the options that are numbers, by name."""
+    ranges = {}
+    for option in fields(TrainingOptions):
+        if "range" in option.metadata:
+            ranges[option.name] = option.metadata["range"]
+    return ranges
+
+
+def with_training_options(
+    annotation: Callable[[str, Any], Any] = lambda name, kind: kind,
+) -> Callable[[Function], Function]:
+    """Decorator: show each training option in a function's signature, in place of `**options`.
+
+    `help`, notebooks and the command line read the signature.
+
+    Args:
+        annotation: gives an option's annotation from its name and type.
+    """
+    kinds = get_type_hints(TrainingOptions)
+    options = []
+    for option in fields(TrainingOptions):
+        shown_as = annotation(option.name, kinds[option.name])
+        options.append(
+            Parameter(
+                option.name,
+                Parameter.KEYWORD_ONLY,
+                default=option.default,
+                annotation=shown_as,
+            )
+        )
+
+    def show(function: Function) -> Function:
+        written = signature(function, eval_str=True)
+        parameters = list(written.parameters.values())
+        assert parameters[-1].kind is Parameter.VAR_KEYWORD
+        parameters[-1:] = options
+        function.__dict__["__signature__"] = written.replace(parameters=parameters)
+        return function
+
+    return show

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 import casadi as ca
@@ -11,12 +12,14 @@ import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
+import fmus
 from controllers.errors import ModelError, OptimumError
 from controllers.model import Model
 from controllers.qp import DAQP_FIXED, DAQP_SETTINGS, DAQP_STATUS, Mask
 from cosim.core.modules import exception_line, load_plugin
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import Penalty, Scenario
+from fmus.states import continuous_states
 
 VECTORS = (
     *("state_lower", "state_upper", "action_lower", "action_upper"),
@@ -555,8 +558,10 @@ class PlantProblem:
         """The problem of a scenario.
 
         The plant's model is `plant.model`, else the controller's. Raises OptimumError where it does
-        not fit the plant, ModelError where it cannot be loaded.
+        not fit the plant, or the state that it has is not the whole state, ModelError where it
+        cannot be loaded.
         """
+        _require_whole_state(scenario)
         problem = Problem.from_scenario(scenario)
         plant = scenario.plant
         table = scenario.disturbance
@@ -594,3 +599,30 @@ class PlantProblem:
             parameters[name] = value
         values = np.array(list(parameters.values()), dtype=np.float64)
         return cls(problem, law, values)
+
+
+def _require_whole_state(scenario: Scenario) -> None:
+    """Raise OptimumError where the plant has states that the scenario does not name."""
+    plant = scenario.plant
+    if scenario.disturbance.coloured:
+        constants = scenario.disturbance.time_constant or ()
+        pairs = zip(plant.disturbances, constants, strict=True)
+        filtered = ", ".join(name for name, constant in pairs if constant)
+        raise OptimumError(
+            f"the optimum needs the plant's whole state: with disturbance.time_constant {filtered} "
+            "have a memory, which no controller is told, so there is no J* of this scenario; "
+            "compare with the best θ of a search on the plant"
+        )
+    # Whoever names the plant's own model says that its states are all that matter.
+    if plant.model is not None:
+        return
+    shipped = (*fmus.NAMES, *fmus.PLANTS)
+    fmu = fmus.path(plant.fmu) if plant.fmu in shipped else Path(plant.fmu)
+    named = {name.partition("[")[0] for name in plant.states}
+    hidden = [name for name in continuous_states(fmu) if name not in named]
+    if hidden:
+        raise OptimumError(
+            f"the optimum needs the plant's whole state: FMU '{fmu.name}' has the states "
+            f"{', '.join(hidden)}, too, which plant.states does not name, so there is no J* of "
+            "this scenario; compare with the best θ of a search on the plant"
+        )

@@ -64,6 +64,8 @@ class MappingTable(Table):
     """One parameter per disturbance for its nominal value."""
     ranges: Names = ()
     """One parameter per disturbance for its half width or standard deviation."""
+    time_constant: Names | None = None
+    """One parameter per disturbance for the time constant of its filter, in s."""
 
 
 class ChangeTable(Table):
@@ -124,7 +126,13 @@ class PlantTable(Table):
 
 
 class DisturbanceTable(Table):
-    """Law of the disturbances, drawn anew each sample and held."""
+    """Law of the disturbances: drawn anew each sample and held, or drawn, filtered and held.
+
+    With a time constant T a disturbance is nominal + range·x_k, the draws w_k filtered:
+    x_k = φ x_{k−1} + √(1 − φ²) w_k with φ = exp(−h/T), from x = w in the first sample. Mean and
+    standard deviation are those of the draws, the autocorrelation over n samples is φⁿ. A uniform
+    law then names the law of the draws: the value goes beyond nominal ± range at times.
+    """
 
     law: Literal["uniform", "normal", "none"] = "none"
     """Uniform about the nominal value, normal about it, or that value itself."""
@@ -132,6 +140,13 @@ class DisturbanceTable(Table):
     """Nominal values, (p,)."""
     ranges: NonNegatives = ()
     """Half widths of the uniform law, standard deviations of the normal one, (p,)."""
+    time_constant: NonNegatives | None = None
+    """Time constants of the filters in s, (p,); 0, or left out: drawn anew each sample."""
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the disturbance of a sample depends on those of the samples before it."""
+        return self.law != "none" and any(self.time_constant or ())
 
 
 class BoundsTable(Table):
@@ -311,6 +326,11 @@ class Scenario(Shown, Table):
                 )
         if law != "none" and not (plant.mapping.law and law in plant.mapping.law_codes):
             raise ValueError(f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes")
+        if any(self.disturbance.time_constant or ()) and not plant.mapping.time_constant:
+            raise ValueError(
+                "disturbance.time_constant: needs plant.mapping.time_constant, a parameter of the "
+                "FMU for each disturbance"
+            )
         return self
 
     def _check_sizes(self) -> None:
@@ -322,8 +342,10 @@ class Scenario(Shown, Table):
             ("plant.mapping.initial_state", "state", True),
             ("plant.mapping.nominal", "disturbance", True),
             ("plant.mapping.ranges", "disturbance", True),
+            ("plant.mapping.time_constant", "disturbance", True),
             ("disturbance.nominal", "disturbance", without_law),
             ("disturbance.ranges", "disturbance", without_law),
+            ("disturbance.time_constant", "disturbance", True),
             ("bounds.state_lower", "state", False),
             ("bounds.state_upper", "state", False),
             ("bounds.action_lower", "action", False),
@@ -341,7 +363,7 @@ class Scenario(Shown, Table):
             "disturbance": len(self.plant.disturbances),
         }
         for field, kind, optional in rules:
-            entries = len(attrgetter(field)(self))
+            entries = len(attrgetter(field)(self) or ())
             if entries == sizes[kind] or (optional and not entries):
                 continue
             raise ValueError(
@@ -382,8 +404,16 @@ class Scenario(Shown, Table):
             "fmu": plant.fmu,
             "states": ", ".join(plant.states),
             "actions": ", ".join(plant.actions),
-            "disturbances": f"{', '.join(plant.disturbances)} ({self.disturbance.law})",
+            "disturbances": f"{', '.join(plant.disturbances)} ({self._law()})",
         }
+
+    def _law(self) -> str:
+        """The law of the disturbances in words."""
+        table = self.disturbance
+        if not table.coloured:
+            return table.law
+        constants = ", ".join(f"{constant:g}" for constant in table.time_constant or ())
+        return f"{table.law}, time constants {constants} s"
 
     @classmethod
     def load(cls, source: str | Path) -> Scenario:
@@ -443,12 +473,16 @@ class Scenario(Shown, Table):
     def hash(self) -> str:
         """First 16 hex digits of the SHA-256 of all that bears on results.
 
-        Left out: name, description, and the folder of a foreign FMU (its file name counts).
+        Left out: name, description, and the folder of a foreign FMU (its file name counts). Time
+        constants that are all zero are none.
         """
         document = self.to_dict()
         del document["name"]
         del document["description"]
         document["plant"]["fmu"] = Path(self.plant.fmu).name
+        if not any(self.disturbance.time_constant or ()):
+            document["disturbance"].pop("time_constant", None)
+            document["plant"]["mapping"].pop("time_constant", None)
         # One text for one content, whatever the order of a file's keys.
         canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]

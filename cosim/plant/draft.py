@@ -32,6 +32,12 @@ NO_NOISE = (
 HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
+PARAMETERS_OF_NOISE = {
+    "nominal": "_nominal",
+    "ranges": "_range",
+    "time_constant": "_time_constant",
+}
+"""Field of the scenario's disturbances, and what our own plants call its parameter after NAME."""
 COSTS = ("cost", "loss", "objective")
 INPUTS_SHOWN = 12
 """Inputs that a remark names at most."""
@@ -228,7 +234,9 @@ def first_document(
     disturbance: dict[str, Any] = {"law": "none"}
     if "nominal" in mapping and "ranges" in mapping:
         disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
-        for field in ("nominal", "ranges"):
+        for field in ("nominal", "ranges", "time_constant"):
+            if field not in mapping:
+                continue
             disturbance[field] = [start_value(archive, name) for name in mapping[field]]
     is_shipped = str(fmu) in SHIPPED_FMUS
     return {
@@ -456,6 +464,11 @@ def _remarks(
         remarks["controller"] = "CHECK: the plant as it starts; it can start nowhere else"
     if document["disturbance"]["law"] == "none":
         remarks["disturbance"] = f"CHECK: {NO_NOISE}"
+    if "time_constant" in document["disturbance"]:
+        remarks["disturbance.time_constant"] = (
+            "s; CHECK: 0 is drawn anew each sample, but what disturbs a plant has a memory of "
+            "minutes as a rule"
+        )
     if "model" not in document["controller"]:
         remarks["controller"] += '; add model = "my_plant:model", a model in CasADi'
     return remarks
@@ -583,7 +596,7 @@ def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
         table["law"] = "law"
         table["law_codes"] = codes
     # Means and ranges of all disturbances, or of none: a scenario has an entry for each.
-    for field, suffix in (("nominal", "_nominal"), ("ranges", "_range")):
+    for field, suffix in PARAMETERS_OF_NOISE.items():
         parameters = [f"{name}{suffix}" for name in noise]
         if parameters and all(is_parameter(name, REALS) for name in parameters):
             table[field] = parameters

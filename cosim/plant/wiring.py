@@ -202,6 +202,7 @@ class Wiring:
         add("plant.mapping.law", mapping.law, codes)
         add("plant.mapping.nominal", mapping.nominal, law.nominal)
         add("plant.mapping.ranges", mapping.ranges, law.ranges)
+        add("plant.mapping.time_constant", mapping.time_constant, law.time_constant or ())
         for name, value in plant.parameters.items():
             add("plant.parameters", name, [value])
         for place in self.seeds:

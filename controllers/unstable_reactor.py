@@ -12,8 +12,9 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     cA, T, Tj = ca.vertsplit(x)
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
-    V, k0, E, heat, UA, coolant, jacket, *_ = ca.vertsplit(p)
-    rate = k0 * ca.exp(-E / T) * cA
+    V, k0, E, heat, diffusion, UA, coolant, jacket, *_ = ca.vertsplit(p)
+    k = k0 * ca.exp(-E / T)
+    rate = k * diffusion / (k + diffusion) * cA
     return ca.vertcat(
         q / V * (cAf - cA) - rate,
         q / V * (Tf - T) + heat * rate + UA * (Tj - T),
@@ -26,7 +27,7 @@ def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     cA = x[0]
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
-    feed, pump, cooling, fixed = ca.vertsplit(p[7:])
+    feed, pump, cooling, fixed = ca.vertsplit(p[8:])
     product = q * (cAf - cA)
     quadratic = pump * q**2 + cooling * (Tf - Tc) ** 2
     return fixed + feed * q * cAf - product + quadratic
@@ -44,14 +45,15 @@ def model() -> Model:
         actions=(Quantity("q", "L/min", 50.0), Quantity("Tc", "K", 290.0)),
         disturbances=(
             Quantity("cAf", "mol/L", 1.0),
-            # Counted from 0 °C, as the evaporator's temperatures are.
-            Quantity("Tf", "K", 350.0, magnitude=76.85),
+            # Counted from the temperature of the surroundings, 300 K.
+            Quantity("Tf", "K", 350.0, magnitude=50.0),
         ),
         parameters=(
             Quantity("V", "L", 100.0),
             Quantity("k0", "1/min", 7.2e10),
             Quantity("E", "K", 8750.0),
             Quantity("heat", "K.L/mol", 209.2),
+            Quantity("diffusion", "1/min", 40.0),
             Quantity("UA", "1/min", 2.09),
             Quantity("coolant", "1/min", 2.0),
             Quantity("jacket", "1/min", 1.5),

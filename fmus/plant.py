@@ -80,6 +80,7 @@ def plant_model(
     disturbances: Sequence[Signal],
     outputs: Sequence[Signal],
     parameters: Sequence[Signal] = (),
+    hidden: Sequence[Signal] = (),
     sampling_time: float,
     description: str = "",
 ) -> FmuModel:
@@ -99,6 +100,7 @@ def plant_model(
         disturbances: drawn anew at the multiples of the sampling time.
         outputs: what else the equations set.
         parameters: of the equations, tunable.
+        hidden: further states, which no controller measures: the terminal does not have them.
         sampling_time: in s.
         description: of the plant, for the model description.
 
@@ -106,13 +108,14 @@ def plant_model(
         The model; `build_plant` makes its FMU.
     """
     # What the equations may use: who wrote them is not asked which of these they do.
-    known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
+    every_state = (*states, *hidden)
+    known = tuple(s.name for s in (*every_state, *inputs, *disturbances, *parameters))
     switches = _switches(sampling_time)
     draws = tuple(v.name for v in switches if v.name != "saturate")
     table = [Variable("time", Kind.INDEPENDENT, unit="s", description="time")]
-    for state in states:
+    for state in every_state:
         table.append(state.variable(Kind.STATE, uses=(f"{state.name}_start",)))
-    for state in states:
+    for state in every_state:
         description_of_rate = f"time derivative of {state.name}"
         rate = Signal(
             f"der({state.name})",
@@ -133,7 +136,7 @@ def plant_model(
     table += switches
     for disturbance in disturbances:
         table += _law_of(disturbance)
-    for state in states:
+    for state in every_state:
         start = replace(
             state,
             name=f"{state.name}_start",
@@ -247,7 +250,7 @@ SHIPPED_PLANTS = {
     "unstable_reactor": ("Exothermic reactor at an unstable steady state", 30.0),
 }
 """By its name each plant's description and sampling time [s]."""
-_ROLES = ("states", "inputs", "disturbances", "outputs", "parameters")
+_ROLES = ("states", "hidden", "inputs", "disturbances", "outputs", "parameters")
 
 
 def model(name: str) -> FmuModel:

@@ -419,7 +419,8 @@ class Scenario(Shown, Table):
     def load(cls, source: str | Path) -> Scenario:
         """Load a preset by name or a TOML file by path; raises ScenarioError.
 
-        `random-SEED` is the evaporator with the random errors of a seed, see `random_plant`.
+        `random-SEED` is the evaporator with the random errors of a seed, see `random_plant`;
+        `random-coloured-SEED` has time constants, too, see `random_coloured_plant`.
         A document with `extends = NAME_OR_PATH` states only what differs from another one.
         """
         document, origin = read(source)
@@ -551,8 +552,8 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
-RANDOM = re.compile(r"random-(0|[1-9]\d{0,8})")
-"""Name of the plant with random errors that a seed draws, `random-7` say."""
+RANDOM = re.compile(r"random-(coloured-)?(0|[1-9]\d{0,8})")
+"""Name of the plant that a seed draws: `random-7` say, with time constants `random-coloured-7`."""
 
 
 RANDOM_PARAMETERS = (
@@ -598,6 +599,37 @@ def random_plant(seed: int) -> dict[str, Any]:
     }
 
 
+COLOURED_SPREAD = 0.8
+"""Standard deviation of a disturbance with a memory, over that of the same plant without.
+
+A filtered uniform draw goes beyond the law's range: so the feed flow does not come near zero.
+"""
+
+
+def random_coloured_plant(seed: int) -> dict[str, Any]:
+    """The changes of `paper` that make the plant of `random_plant` with time constants.
+
+    Each disturbance has one with probability 3/4, log-uniform from 1 to 20 minutes, rounded to four
+    digits. They are drawn from a stream of their own, so that all else is that of `random-SEED`,
+    but for the standard deviations, which are 0.8 times as large.
+    """
+    rng = np.random.default_rng([seed, 1])
+    plant = random_plant(seed)
+    disturbance = plant["disturbance"]
+    time_constants = []
+    for _ in disturbance["nominal"]:
+        has_memory = rng.uniform() < 0.75
+        seconds = 60.0 * 20.0 ** rng.uniform()
+        time_constants.append(_four_digits(seconds) if has_memory else 0.0)
+    ranges = [_four_digits(COLOURED_SPREAD * value) for value in disturbance["ranges"]]
+    return plant | {
+        "name": f"random-coloured-{seed}",
+        "description": f"The evaporator with the random errors and the time constants of its "
+        f"disturbances that seed {seed} draws; the controller is not told",
+        "disturbance": disturbance | {"ranges": ranges, "time_constant": time_constants},
+    }
+
+
 def _four_digits(value: float) -> float:
     """A number rounded to four significant digits."""
     return float(f"{value:.4g}")
@@ -607,7 +639,7 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     """Read a preset or file and what it extends.
 
     Args:
-        source: a preset's name, `random-SEED`, or the path of a TOML file.
+        source: a preset's name, `random-SEED`, `random-coloured-SEED`, or the path of a TOML file.
         seen: files that led here.
 
     Returns:
@@ -623,7 +655,8 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     random = RANDOM.fullmatch(str(source))
     if random is not None:
         paper, _ = read("paper")
-        return paper | random_plant(int(random[1])), f"preset '{source}'"
+        draw = random_coloured_plant if random[1] else random_plant
+        return paper | draw(int(random[2])), f"preset '{source}'"
     path = Path(source)
     origin = f"scenario file '{source}'"
     if str(source) in presets():
@@ -632,7 +665,8 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     elif path.suffix != ".toml" and len(path.parts) < 2:
         raise ScenarioError(
             f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
-            f"{', '.join(presets())} and random-SEED, or give the path of a TOML file"
+            f"{', '.join(presets())}, random-SEED and random-coloured-SEED, or give the path of a "
+            "TOML file"
         )
     document = read_toml(path, origin, ScenarioError)
     place = path.resolve()

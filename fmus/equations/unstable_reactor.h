@@ -11,7 +11,8 @@
 static void evaluate(double v[N_VARIABLES]) {
     const double exponent = v[VR_E] / v[VR_T]; /* no reaction where the temperature is none */
     const double k = exponent >= 0.0 && exponent < 700.0 ? v[VR_k0] * exponential(-exponent) : 0.0;
-    const double rate = k * v[VR_cA];
+    /* However hot it is, A has to come to the catalyst. */
+    const double rate = k * v[VR_diffusion] / (k + v[VR_diffusion]) * v[VR_cA];
     const double dilution = v[VR_q] / v[VR_V];
     v[VR_der_cA] = (dilution * (v[VR_cAf] - v[VR_cA]) - rate) / SECONDS;
     v[VR_der_T] = (dilution * (v[VR_Tf] - v[VR_T]) + v[VR_heat] * rate +

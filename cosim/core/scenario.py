@@ -524,6 +524,14 @@ class Scenario(Shown, Table):
             self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
         )
 
+    @property
+    def memory(self) -> float:
+        """Longest time constant of the disturbances, in samples; 0 where each draw is new."""
+        table = self.disturbance
+        if not table.coloured:
+            return 0.0
+        return max(table.time_constant or ()) / self.sampling_time
+
     def saturate(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """Actions (…, m) clipped to the actuators' bounds."""
         return np.minimum(np.maximum(action, self.action_lower), self.action_upper)

@@ -1,0 +1,129 @@
+"""Disturbances with a time constant: their statistics, seeds, and what must refuse them."""
+
+import numpy as np
+import pytest
+
+from controllers import OptimalPolicy
+from controllers.errors import OptimumError
+from controllers.factories import naive
+from controllers.optimum import stored_optimum
+from cosim import FmuPlant, Scenario, simulate
+from cosim.core.errors import PlantError, ScenarioError
+from cosim.core.scenario import random_coloured_plant, random_plant
+
+TIME_CONSTANTS = [120.0, 300.0, 600.0, 0.0]
+SAMPLES = 30_000
+
+
+def disturbances(plant, samples: int, seed: int) -> np.ndarray:
+    """Deviations from the nominal values in ranges, (K, p)."""
+    law = plant.scenario.disturbance
+    plant.reset(seed)
+    rows = [plant.step(plant.scenario.reference_action).disturbance for _ in range(samples)]
+    return (np.array(rows) - law.nominal) / law.ranges
+
+
+@pytest.mark.parametrize(("law", "variance"), [("uniform", 1 / 3), ("normal", 1.0)])
+def test_mean_variance_and_autocorrelation_are_those_of_theory(paper, law, variance) -> None:
+    table = {"law": law, "time_constant": TIME_CONSTANTS, "ranges": [0.2, 0.4, 1.6, 1.0]}
+    with FmuPlant(paper.replace({"disturbance": table})) as plant:
+        x = disturbances(plant, SAMPLES, seed=5)
+    phi = np.exp(-60.0 / np.maximum(TIME_CONSTANTS, 1e-3))
+    # Bartlett: with autocorrelation φⁿ there are so many independent samples for mean and variance.
+    for_mean = SAMPLES * (1 - phi) / (1 + phi)
+    for_variance = SAMPLES * (1 - phi**2) / (1 + phi**2)
+    assert (np.abs(x.mean(axis=0)) < 4.5 * np.sqrt(variance / for_mean)).all()
+    squares = 4.5 * variance * np.sqrt(2 / for_variance)
+    assert (np.abs(x.var(axis=0) - variance) < squares).all()
+    for lag in (1, 5, 20):
+        found = (x[lag:] * x[:-lag]).mean(axis=0)
+        assert (np.abs(found - variance * phi**lag) < squares).all(), lag
+
+
+def test_a_start_is_stationary_too(paper) -> None:
+    """The first samples of many seeds have the law's deviation, and seeds nothing in common."""
+    scenario = paper.replace({"disturbance": {"time_constant": [3600.0] * 4}})
+    with FmuPlant(scenario) as plant:
+        x = np.array([disturbances(plant, 3, seed) for seed in range(1500)])
+    np.testing.assert_allclose(x.std(axis=0), 1 / np.sqrt(3), rtol=0.08)
+    between_seeds = np.corrcoef(x[1:, 2].T, x[:-1, 2].T) - np.eye(8)
+    assert np.abs(between_seeds).max() < 4.5 / np.sqrt(1499)
+
+
+def test_a_serialised_plant_meets_the_same_values_in_another() -> None:
+    scenario = Scenario.load("coloured-5")
+    with FmuPlant(scenario) as plant:
+        whole = disturbances(plant, 60, seed=3)
+        np.testing.assert_array_equal(disturbances(plant, 30, seed=3), whole[:30])
+        data = plant.serialise(plant.snapshot())
+    with FmuPlant(scenario) as plant:
+        plant.restore(plant.deserialise(data))
+        steps = [plant.step(scenario.reference_action) for _ in range(30)]
+    law = scenario.disturbance
+    rest = (np.array([step.disturbance for step in steps]) - law.nominal) / law.ranges
+    np.testing.assert_array_equal(rest, whole[30:])
+
+
+def test_time_constants_of_zero_are_none(paper) -> None:
+    zero = paper.replace({"disturbance": {"time_constant": [0.0] * 4}})
+    assert zero.hash == paper.hash
+    assert not zero.disturbance.coloured and zero.memory == 0.0
+    runs = []
+    for scenario in (paper, zero):
+        with FmuPlant(scenario) as plant:
+            runs.append(simulate(plant, naive(scenario), 50, seed=3))
+    np.testing.assert_array_equal(runs[0].states, runs[1].states)
+    assert Scenario.load("coloured-5").memory == 5.0
+    assert Scenario.load("coloured-5").hash != Scenario.load("coloured-2").hash
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"disturbance": {"time_constant": [60.0]}}, "time_constant: must have one entry per"),
+        ({"disturbance": {"time_constant": [-1.0] * 4}}, r"disturbance\.time_constant\[0\]"),
+        ({"disturbance": {"time_constant": [60.0] * 4}}, "needs plant.mapping.time_constant"),
+        ({"plant": {"mapping": {"time_constant": ["X1_time_constant"]}}}, "one entry per"),
+    ],
+)
+def test_a_wrong_field_is_one_clear_line(paper, changes, words) -> None:
+    document = paper.to_dict()
+    del document["plant"]["mapping"]["time_constant"]
+    without = Scenario.from_dict(document)
+    with pytest.raises(ScenarioError, match=words) as error:
+        without.replace(changes)
+    assert "\n" not in str(error.value)
+
+
+def test_a_time_constant_that_the_fmu_does_not_take_is_an_error(paper) -> None:
+    longest = paper.replace({"disturbance": {"time_constant": [1e9] * 4}})
+    with pytest.raises(PlantError, match="X1_time_constant"), FmuPlant(longest) as plant:
+        plant.reset(0)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("coloured-2", "X1, F1, T1, T200 have a memory"), ("dead-time", "tank, pipe1, .*pipe7, too")],
+)
+def test_the_optimum_of_a_plant_with_hidden_states_is_refused(name, words) -> None:
+    scenario = Scenario.load(name)
+    with pytest.raises(OptimumError, match=words) as error:
+        OptimalPolicy.from_scenario(scenario)
+    assert "\n" not in str(error.value)
+    assert stored_optimum(scenario) is None
+
+
+def test_a_random_plant_with_time_constants_is_the_same_without_them() -> None:
+    """And the first sixteen are those of the random plants that were there before."""
+    longest = []
+    for seed in range(32):
+        plain, coloured = random_plant(seed), random_coloured_plant(seed)
+        for field in ("sampling_time", "plant"):
+            assert coloured[field] == plain[field]
+        ranges = np.array(plain["disturbance"]["ranges"])
+        np.testing.assert_allclose(coloured["disturbance"]["ranges"], 0.8 * ranges, rtol=1e-3)
+        longest.append(max(coloured["disturbance"]["time_constant"]))
+    assert min(longest) >= 60.0 and max(longest) <= 1200.0
+    first = Scenario.load("random-coloured-0")
+    assert first.disturbance.time_constant == (0.0, 0.0, 121.8, 0.0)
+    assert Scenario.load("random-coloured-31").hash == "c41cdc3853fc2f7d"

@@ -19,7 +19,7 @@ from controllers.qp import DAQP_FIXED, DAQP_SETTINGS, DAQP_STATUS, Mask
 from cosim.core.modules import exception_line, load_plugin
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import Penalty, Scenario
-from fmus.states import continuous_states
+from fmus.states import continuous_states, time_constants
 
 VECTORS = (
     *("state_lower", "state_upper", "action_lower", "action_upper"),
@@ -604,20 +604,24 @@ class PlantProblem:
 def _require_whole_state(scenario: Scenario) -> None:
     """Raise OptimumError where the plant has states that the scenario does not name."""
     plant = scenario.plant
-    if scenario.disturbance.coloured:
-        constants = scenario.disturbance.time_constant or ()
-        pairs = zip(plant.disturbances, constants, strict=True)
-        filtered = ", ".join(name for name, constant in pairs if constant)
+    shipped = (*fmus.NAMES, *fmus.PLANTS)
+    fmu = fmus.path(plant.fmu) if plant.fmu in shipped else Path(plant.fmu)
+    constants = dict(
+        zip(plant.disturbances, scenario.disturbance.time_constant or (), strict=False)
+    )
+    # What no scenario sets is as the FMU has it.
+    if not plant.mapping.time_constant:
+        constants |= time_constants(fmu)
+    filtered = [name for name, constant in constants.items() if constant]
+    if filtered and scenario.disturbance.law != "none":
         raise OptimumError(
-            f"the optimum needs the plant's whole state: with disturbance.time_constant {filtered} "
-            "have a memory, which no controller is told, so there is no J* of this scenario; "
-            "compare with the best θ of a search on the plant"
+            f"the optimum needs the plant's whole state: {', '.join(filtered)} have a memory, by "
+            "disturbance.time_constant, which no controller is told, so there is no J* of this "
+            "scenario; compare with the best θ of a search on the plant"
         )
     # Whoever names the plant's own model says that its states are all that matter.
     if plant.model is not None:
         return
-    shipped = (*fmus.NAMES, *fmus.PLANTS)
-    fmu = fmus.path(plant.fmu) if plant.fmu in shipped else Path(plant.fmu)
     named = {name.partition("[")[0] for name in plant.states}
     hidden = [name for name in continuous_states(fmu) if name not in named]
     if hidden:

@@ -1,5 +1,7 @@
 """Disturbances with a time constant: their statistics, seeds, and what must refuse them."""
 
+import tomllib
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,13 @@ from controllers import OptimalPolicy
 from controllers.errors import OptimumError
 from controllers.factories import naive
 from controllers.optimum import stored_optimum
+from controllers.problem import PlantProblem
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.errors import PlantError, ScenarioError
 from cosim.core.scenario import random_coloured_plant, random_plant
+from cosim.plant.draft import draft_scenario
+from fmus.plant import Signal, build_plant, plant_model
+from tests.helpers.compiler import needs_compiler
 
 TIME_CONSTANTS = [120.0, 300.0, 600.0, 0.0]
 SAMPLES = 30_000
@@ -111,6 +117,52 @@ def test_the_optimum_of_a_plant_with_hidden_states_is_refused(name, words) -> No
         OptimalPolicy.from_scenario(scenario)
     assert "\n" not in str(error.value)
     assert stored_optimum(scenario) is None
+
+
+FILTERED = """
+#pragma once
+#include "variables.h"
+static void evaluate(double v[N_VARIABLES]) {
+    v[VR_der_x] = v[VR_u] + v[VR_d] - v[VR_x];
+    v[VR_cost] = v[VR_x];
+}
+"""
+
+
+@needs_compiler
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_plant_of_ones_own_has_a_time_constant_of_its_own(tmp_path, version) -> None:
+    """A scenario that leaves it out draws anew; one that does not map it takes the FMU's."""
+    table = plant_model(
+        "lag",
+        states=[Signal("x", "m", 0.0, -10.0, 10.0, "level")],
+        inputs=[Signal("u", "m", 0.0, -1.0, 1.0, "inflow")],
+        disturbances=[Signal("d", "m", 0.0, -9.0, 9.0, "rain", 0.5, time_constant=20.0)],
+        outputs=[Signal("cost", "1", 0.0, -9.0, 9.0, "cost")],
+        sampling_time=2.0,
+    )
+    fmu = build_plant(table, FILTERED, tmp_path / "lag.fmu", version)
+    drafted = Scenario.from_dict(tomllib.loads(draft_scenario(fmu, tmp_path / "lag.toml")))
+    drafted = drafted.replace({"plant": {"fmu": str(fmu)}})
+    assert drafted.disturbance.time_constant == (20.0,)
+    document = drafted.to_dict()
+    del document["disturbance"]["time_constant"]
+    white = Scenario.from_dict(document)
+    del document["plant"]["mapping"]["time_constant"]
+    unmapped = Scenario.from_dict(document)
+    series = []
+    for scenario in (drafted, white, unmapped):
+        with FmuPlant(scenario) as plant:
+            series.append(disturbances(plant, 50, seed=3)[:, 0])
+    phi = np.exp(-2.0 / 20.0)
+    filtered = [series[1][0]]
+    for w in series[1][1:]:
+        filtered.append(phi * filtered[-1] + np.sqrt(1 - phi**2) * w)
+    np.testing.assert_allclose(series[0], filtered, atol=1e-12)
+    np.testing.assert_array_equal(series[2], series[0])
+    for scenario in (drafted, unmapped):
+        with pytest.raises(OptimumError, match="d have a memory"):
+            PlantProblem.from_scenario(scenario)
 
 
 def test_a_random_plant_with_time_constants_is_the_same_without_them() -> None:

@@ -37,6 +37,12 @@ def test_the_value_is_the_draws_filtered(open_fmu, version: int, law: int) -> No
     np.testing.assert_array_equal(coloured[:, 2], white[:, 2])
 
 
+def test_both_versions_of_fmi_give_the_same_bits(open_fmu) -> None:
+    two = open_fmu(2).initialise(seed=3, law=2, **COLOURED)
+    three = open_fmu(3).initialise(seed=3, law=2, **COLOURED)
+    assert two.run(30) == three.run(30)
+
+
 def test_a_later_start_begins_anew(open_fmu, version: int) -> None:
     white = deviations(open_fmu(version).initialise(start=600.0, seed=3), 20, 600.0)
     coloured = deviations(open_fmu(version).initialise(start=600.0, seed=3, **COLOURED), 20, 600.0)

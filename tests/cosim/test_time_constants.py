@@ -109,7 +109,7 @@ def test_a_time_constant_that_the_fmu_does_not_take_is_an_error(paper) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("coloured-2", "X1, F1, T1, T200 have a memory"), ("dead-time", "tank, pipe1, .*pipe7, too")],
+    [("coloured-2", "X1, F1, T1, T200 have one"), ("dead-time", "tank, pipe1, .*pipe7, too")],
 )
 def test_the_optimum_of_a_plant_with_hidden_states_is_refused(name, words) -> None:
     scenario = Scenario.load(name)
@@ -123,7 +123,7 @@ FILTERED = """
 #pragma once
 #include "variables.h"
 static void evaluate(double v[N_VARIABLES]) {
-    v[VR_der_x] = v[VR_u] + v[VR_d] - v[VR_x];
+    v[VR_der_x] = v[VR_u] + v[VR_d] + v[VR_e] - v[VR_x];
     v[VR_cost] = v[VR_x];
 }
 """
@@ -137,14 +137,17 @@ def test_a_plant_of_ones_own_has_a_time_constant_of_its_own(tmp_path, version) -
         "lag",
         states=[Signal("x", "m", 0.0, -10.0, 10.0, "level")],
         inputs=[Signal("u", "m", 0.0, -1.0, 1.0, "inflow")],
-        disturbances=[Signal("d", "m", 0.0, -9.0, 9.0, "rain", 0.5, time_constant=20.0)],
+        disturbances=[
+            Signal("d", "m", 0.0, -9.0, 9.0, "rain", 0.5, time_constant=20.0),
+            Signal("e", "m", 0.0, -9.0, 9.0, "snow", 0.5, time_constant=1.0),
+        ],
         outputs=[Signal("cost", "1", 0.0, -9.0, 9.0, "cost")],
         sampling_time=2.0,
     )
     fmu = build_plant(table, FILTERED, tmp_path / "lag.fmu", version)
     drafted = Scenario.from_dict(tomllib.loads(draft_scenario(fmu, tmp_path / "lag.toml")))
     drafted = drafted.replace({"plant": {"fmu": str(fmu)}})
-    assert drafted.disturbance.time_constant == (20.0,)
+    assert drafted.disturbance.time_constant == (20.0, 1.0)
     document = drafted.to_dict()
     del document["disturbance"]["time_constant"]
     white = Scenario.from_dict(document)
@@ -161,8 +164,36 @@ def test_a_plant_of_ones_own_has_a_time_constant_of_its_own(tmp_path, version) -
     np.testing.assert_allclose(series[0], filtered, atol=1e-12)
     np.testing.assert_array_equal(series[2], series[0])
     for scenario in (drafted, unmapped):
-        with pytest.raises(OptimumError, match="d have a memory"):
+        with pytest.raises(OptimumError, match="d, e have one"):
             PlantProblem.from_scenario(scenario)
+
+
+def test_one_disturbance_with_a_memory_makes_a_state_of_the_optimum(paper) -> None:
+    table = {"time_constant": [300.0, 0.0, 0.0, 0.0]}
+    scenario = paper.replace({"disturbance": table})
+    problem = PlantProblem.from_scenario(scenario)
+    assert problem.memory is not None
+    assert problem.memory.phi == pytest.approx(np.exp(-0.2))
+    # The model's sample is the FMU's, from any value of the filter.
+    step = problem.sampled(40)
+    x, xi = np.array([27.0, 55.0]), 0.3
+    w = np.array([-0.4, 11.0, 42.0, 24.0])
+    realised = problem.memory.phi * xi + np.sqrt(1 - problem.memory.phi**2) * w[0]
+    action = scenario.reference_action + 5.0
+    after = step(np.append(x, xi), action, w, problem.parameters)
+    assert float(after[2]) == pytest.approx(realised)
+    given = {"override": True, "X1_in": 5.0 + realised, "F1_in": 11.0, "T1_in": 42.0}
+    held = paper.replace({"plant": {"parameters": given | {"T200_in": 24.0}}})
+    with FmuPlant(held) as plant:
+        plant.reset(0, x)
+        np.testing.assert_allclose(np.array(after).ravel()[:2], plant.step(action).s, rtol=1e-8)
+    # Others vary, too: no two states in a row tell what X1 was.
+    assert problem.unseen == "X1"
+    alone = scenario.replace({"disturbance": table | {"ranges": [1.0, 0.0, 0.0, 0.0]}})
+    assert PlantProblem.from_scenario(alone).unseen == ""
+    with pytest.raises(OptimumError, match="the value that X1 had"):
+        OptimalPolicy.from_scenario(alone)
+    assert stored_optimum(alone) is None
 
 
 def test_a_random_plant_with_time_constants_is_the_same_without_them() -> None:

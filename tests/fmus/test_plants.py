@@ -146,7 +146,7 @@ def test_draws_fill_their_ranges_and_repeat_with_the_seed(example):
 
 @pytest.mark.slow
 def test_tuning_finds_the_stored_reference(example, tmp_path):
-    found = result_of(tmp_path, "tuning", "--scenario", example.name)
+    found = result_of(tmp_path, "tuning", "--scenario", example.scenario.name)
     steady = found["steady_state"]
     np.testing.assert_allclose(steady["states"], example.scenario.reference_state, rtol=1e-6)
     np.testing.assert_allclose(steady["actions"], example.scenario.reference_action, rtol=1e-6)
@@ -154,9 +154,9 @@ def test_tuning_finds_the_stored_reference(example, tmp_path):
 
 @pytest.mark.slow
 def test_the_optimum_of_an_own_model_is_the_documented_one(example, tmp_path, monkeypatch):
-    """The tanks have too many states."""
-    if len(example.scenario.plant.states) > 2:
-        pytest.skip("a grid over four states is out of reach")
+    """The tanks and the unstable reactor have too many states, and the heater hides some."""
+    if example.name != "reactor":
+        pytest.skip("it has no documented optimum")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     found = result_of(tmp_path, "optimum", "--scenario", example.name, "--recompute")
     stated = re.search(

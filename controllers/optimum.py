@@ -75,6 +75,8 @@ def optimum_key(plant: PlantProblem, settings: Settings) -> str:
     }
     for name in VECTORS:
         content[name] = getattr(problem, name).tolist()
+    if plant.memory is not None:
+        content["memory"] = asdict(plant.memory)
     text = json.dumps(content, sort_keys=True)
     digest = hashlib.sha256(text.encode())
     return digest.hexdigest()[:16]
@@ -251,6 +253,12 @@ class OptimalPolicy:
             OptimumError: A stored file is damaged, or the problem is not solved.
         """
         plant = PlantProblem.from_scenario(scenario)
+        if plant.memory is not None:
+            name = plant.problem.model.disturbances[plant.memory.disturbance].name
+            raise OptimumError(
+                f"the optimal policy needs the value that {name} had in the sample before, which a "
+                "controller is not told; its J is that of `cosim optimum`"
+            )
         key = optimum_key(plant, Settings())
         path = stored_file(key)
         if path is None:
@@ -621,6 +629,9 @@ def stored_optimum(scenario: Scenario) -> str | None:
         try:
             problem = PlantProblem.from_scenario(plant)
         except (ModelError, OptimumError):
+            return None
+        # No controller is told what this policy needs.
+        if problem.memory is not None:
             return None
         if stored_file(optimum_key(problem, Settings())) is None:
             return None

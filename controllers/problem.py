@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import exp, sqrt
+from pathlib import Path
 from typing import Literal
 
 import casadi as ca
@@ -11,12 +14,15 @@ import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
+import fmus
 from controllers.errors import ModelError, OptimumError
-from controllers.model import Model
+from controllers.memory import Memory, remember
+from controllers.model import Model, discretise
 from controllers.qp import DAQP_FIXED, DAQP_SETTINGS, DAQP_STATUS, Mask
 from cosim.core.modules import exception_line, load_plugin
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import Penalty, Scenario
+from fmus.states import continuous_states, time_constants
 
 VECTORS = (
     *("state_lower", "state_upper", "action_lower", "action_upper"),
@@ -539,24 +545,89 @@ class DisturbanceLaw:
         return self.nominal + self.ranges * unit
 
 
+MEMORY_REACH = 5.0
+"""Standard deviations of a filter's value to its bound; the optimum's grid goes a fifth beyond."""
+NO_PENALTY = 1e-12
+"""Weight of a violation of that bound: nothing, but a problem's weights are positive."""
 NAME_THE_MODEL = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
 
 
 @dataclass(frozen=True)
 class PlantProblem:
-    """The problem with the plant's own model, its `law` and physical `parameters` (n_p,)."""
+    """The problem with the plant's own model, its `law` and physical `parameters` (n_p,).
+
+    Where a disturbance has a `memory`, the last state is its filter's value, and `law` that of its
+    draws.
+    """
 
     problem: Problem
     law: DisturbanceLaw
     parameters: Vector
+    memory: Memory | None = None
+
+    def with_memory(self, i: int, phi: float) -> PlantProblem:
+        """The plant with a filter of disturbance i: its value is the last state, its draw d_i.
+
+        Args:
+            i: index of the disturbance, whose law is that of the draws.
+            phi: φ of the filter, in (0, 1).
+        """
+        problem = self.problem
+        law = self.law
+        memory = Memory(i, problem.n_states, phi)
+        model = remember(problem.model, memory, float(law.nominal[i]), float(law.ranges[i]))
+        nominal = law.nominal.copy()
+        ranges = law.ranges.copy()
+        nominal[i] = 0.0
+        ranges[i] = 1.0
+        # A uniform draw on [−1, 1] has the standard deviation 1/√3.
+        reach = MEMORY_REACH / sqrt(3.0) if law.kind == "uniform" else MEMORY_REACH
+        larger = replace(
+            problem,
+            model=model,
+            state_lower=np.append(problem.state_lower, -reach),
+            state_upper=np.append(problem.state_upper, reach),
+            penalty_linear=np.append(problem.penalty_linear, NO_PENALTY),
+            penalty_quadratic=np.append(problem.penalty_quadratic, NO_PENALTY),
+            reference_state=np.append(problem.reference_state, 0.0),
+        )
+        return PlantProblem(
+            larger, DisturbanceLaw(law.kind, nominal, ranges), self.parameters, memory
+        )
+
+    def sampled(self, substeps: int) -> ca.Function:
+        """The state after a sample, a function (x, u, d, p), by so many RK4 steps."""
+        problem = self.problem
+        step = discretise(problem.model, problem.sampling_time, substeps)
+        if self.memory is None:
+            return step
+        x, u, d, p = problem.model.symbols()
+        next_x = step(x, u, d, p)
+        next_x[self.memory.state] = self.memory.next_value(x, d)
+        return ca.Function("sampled", [x, u, d, p], [next_x])
+
+    @property
+    def unseen(self) -> str:
+        """Name of a disturbance whose memory the states do not tell; empty where there is none.
+
+        Where nothing else varies, two states in a row tell what the disturbance was.
+        """
+        if self.memory is None:
+            return ""
+        others = np.delete(self.law.ranges, self.memory.disturbance)
+        i = self.memory.disturbance
+        return self.problem.model.disturbances[i].name if others.any() else ""
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> PlantProblem:
         """The problem of a scenario.
 
         The plant's model is `plant.model`, else the controller's. Raises OptimumError where it does
-        not fit the plant, ModelError where it cannot be loaded.
+        not fit the plant, or the state that it has is not the whole state, ModelError where it
+        cannot be loaded.
         """
+        filtered = _filtered(scenario)
+        _require_whole_state(scenario, filtered)
         problem = Problem.from_scenario(scenario)
         plant = scenario.plant
         table = scenario.disturbance
@@ -593,4 +664,58 @@ class PlantProblem:
                 )
             parameters[name] = value
         values = np.array(list(parameters.values()), dtype=np.float64)
-        return cls(problem, law, values)
+        white = cls(problem, law, values)
+        for name, constant in filtered.items():
+            phi = exp(-problem.sampling_time / constant)
+            return white.with_memory(plant.disturbances.index(name), phi)
+        return white
+
+
+def _fmu_file(scenario: Scenario) -> Path:
+    """Path of the plant's FMU."""
+    fmu = scenario.plant.fmu
+    return fmus.path(fmu) if fmu in (*fmus.NAMES, *fmus.PLANTS) else Path(fmu)
+
+
+def _filtered(scenario: Scenario) -> dict[str, float]:
+    """Time constants in s of the disturbances that vary and have a memory, by name."""
+    plant = scenario.plant
+    table = scenario.disturbance
+    constants = dict(zip(plant.disturbances, table.time_constant or (), strict=False))
+    # What no scenario sets is as the FMU has it.
+    if not plant.mapping.time_constant:
+        constants |= time_constants(_fmu_file(scenario))
+    ranges = dict(zip(plant.disturbances, table.ranges, strict=False))
+    filtered = {}
+    for name, constant in constants.items():
+        if constant > 0.0 and table.law != "none" and ranges.get(name, 1.0) > 0.0:
+            filtered[name] = constant
+    return filtered
+
+
+def _require_whole_state(scenario: Scenario, filtered: Mapping[str, float]) -> None:
+    """Raise OptimumError where the plant has states that the optimum cannot have.
+
+    Args:
+        scenario: of the plant.
+        filtered: the disturbances with a memory.
+    """
+    plant = scenario.plant
+    if len(filtered) > 1:
+        raise OptimumError(
+            f"the optimum is computed for one disturbance with a memory: {', '.join(filtered)} "
+            "have one, by disturbance.time_constant, and so many states are too many for a grid; "
+            "compare with the best θ of a search on the plant"
+        )
+    # Whoever names the plant's own model says that its states are all that matter.
+    if plant.model is not None:
+        return
+    fmu = _fmu_file(scenario)
+    named = {name.partition("[")[0] for name in plant.states}
+    hidden = [name for name in continuous_states(fmu) if name not in named]
+    if hidden:
+        raise OptimumError(
+            f"the optimum needs the plant's whole state: FMU '{fmu.name}' has the states "
+            f"{', '.join(hidden)}, too, which plant.states does not name, so there is no J* of "
+            "this scenario; compare with the best θ of a search on the plant"
+        )

@@ -11,7 +11,7 @@ from fmus.errors import BuildError, CheckError, FmuError
 __all__ = ["NAMES", "PLANTS", "BuildError", "CheckError", "FmuError", "path"]
 
 NAMES = ("evaporator", "evaporator_fmi3")
-PLANTS = ("reactor", "tanks")
+PLANTS = ("reactor", "tanks", "heater", "unstable_reactor")
 
 
 def path(name: str = "evaporator") -> Path:

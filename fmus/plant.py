@@ -1,6 +1,6 @@
 """A plant of one's own as an FMU: a table of variables in Python, the equations in C, no more.
 
-The benchmark's own beside the evaporator, an exothermic reactor and four tanks, are made so: their
+The benchmark's own beside the evaporator are made so: their
 variables are in `resources/NAME.csv`, their right-hand sides in `equations/NAME.h`.
 """
 
@@ -17,9 +17,13 @@ from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable, read_variable
 
 # The evaporator's sources that serve any plant; the others are its own or generated.
 _SHARED = (
-    "disturbance.h", "elementary.h", "events.h", "model_state.h", "philox.h", "sampled.h", "seed.h",
-    "simulation.h",
+    "deviations.h", "disturbance.h", "elementary.h", "events.h", "model_state.h", "philox.h",
+    "sampled.h", "seed.h", "simulation.h",
 )  # fmt: skip
+
+
+LONGEST_TIME_CONSTANT = 1e6
+"""Largest time constant of a disturbance's filter, in s: eleven days."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class Signal:
         min, max: its range.
         description: in words.
         range: a disturbance's half width (uniform) or standard deviation.
+        time_constant: of the filter of a disturbance's draws, in s; 0: there is none.
     """
 
     name: str
@@ -43,6 +48,7 @@ class Signal:
     max: float = inf
     description: str = ""
     range: float = 0.0
+    time_constant: float = 0.0
 
     def variable(self, kind: Kind, uses: tuple[str, ...] = ()) -> Variable:
         """The signal as a row of a table.
@@ -74,13 +80,15 @@ def plant_model(
     disturbances: Sequence[Signal],
     outputs: Sequence[Signal],
     parameters: Sequence[Signal] = (),
+    hidden: Sequence[Signal] = (),
     sampling_time: float,
     description: str = "",
 ) -> FmuModel:
     """The table of an FMU from the signals of a plant.
 
     Each state x has a derivative ``der(x)`` (in C ``VR_der_x``) and a start parameter ``x_start``,
-    each disturbance d a mean ``d_nominal`` and a ``d_range``. Beside them are the switches:
+    each disturbance d a mean ``d_nominal``, a ``d_range`` and a ``d_time_constant`` [s]: 0, and it
+    is drawn anew in each sample, else the draws are filtered. Beside them are the switches:
     ``stochastic``, ``law`` (1 uniform, 2 normal; FMI 2.0 has an integer ``law_number``, too),
     ``seed``, ``seedHigh`` (FMI 2.0), ``sampling_time`` [s] and ``saturate``, with which an input
     beyond its range acts at the bound.
@@ -92,6 +100,7 @@ def plant_model(
         disturbances: drawn anew at the multiples of the sampling time.
         outputs: what else the equations set.
         parameters: of the equations, tunable.
+        hidden: further states, which no controller measures: the terminal does not have them.
         sampling_time: in s.
         description: of the plant, for the model description.
 
@@ -99,13 +108,14 @@ def plant_model(
         The model; `build_plant` makes its FMU.
     """
     # What the equations may use: who wrote them is not asked which of these they do.
-    known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
+    every_state = (*states, *hidden)
+    known = tuple(s.name for s in (*every_state, *inputs, *disturbances, *parameters))
     switches = _switches(sampling_time)
     draws = tuple(v.name for v in switches if v.name != "saturate")
     table = [Variable("time", Kind.INDEPENDENT, unit="s", description="time")]
-    for state in states:
+    for state in every_state:
         table.append(state.variable(Kind.STATE, uses=(f"{state.name}_start",)))
-    for state in states:
+    for state in every_state:
         description_of_rate = f"time derivative of {state.name}"
         rate = Signal(
             f"der({state.name})",
@@ -126,7 +136,7 @@ def plant_model(
     table += switches
     for disturbance in disturbances:
         table += _law_of(disturbance)
-    for state in states:
+    for state in every_state:
         start = replace(
             state,
             name=f"{state.name}_start",
@@ -135,6 +145,9 @@ def plant_model(
         table.append(start.variable(Kind.FIXED))
     for parameter in parameters:
         table.append(parameter.variable(Kind.TUNABLE))
+    # Last, so that the other value references are those of a plant made before there were filters.
+    for disturbance in disturbances:
+        table.append(_time_constant_of(disturbance))
     return FmuModel(
         name=name,
         identifier=name,
@@ -173,6 +186,20 @@ def _law_of(disturbance: Signal) -> tuple[Variable, Variable]:
     return mean.variable(Kind.TUNABLE), spread.variable(Kind.TUNABLE)
 
 
+def _time_constant_of(disturbance: Signal) -> Variable:
+    """Time constant of the filter of a disturbance's draws, which is a parameter."""
+    time_constant = Signal(
+        f"{disturbance.name}_time_constant",
+        "s",
+        start=disturbance.time_constant,
+        min=0.0,
+        max=LONGEST_TIME_CONSTANT,
+        description=f"time constant of the filter of the {disturbance.description}; "
+        "0: drawn anew in each sample",
+    )
+    return time_constant.variable(Kind.FIXED)
+
+
 def build_plant(
     model: FmuModel,
     equations: str | bytes,
@@ -182,8 +209,8 @@ def build_plant(
 ) -> Path:
     """Compile a plant's equations into an FMU, for co-simulation and model exchange.
 
-    It has snapshots and their serialisation, draws that are a function of seed and sample, and
-    fourth-order Runge–Kutta steps of at most 1 s.
+    It has snapshots and their serialisation, draws that are a function of seed and sample, filters
+    of them whose values are part of its state, and fourth-order Runge–Kutta steps of at most 1 s.
 
     Args:
         model: the table of its variables, by `plant_model`.
@@ -219,9 +246,11 @@ SHIPPED_PLANTS = {
     "reactor": ("Exothermic stirred-tank reactor with disturbed feed", 12.0),
     # Johansson (2000)
     "tanks": ("Quadruple tank with water drawn at random from the lower tanks", 5.0),
+    "heater": ("Heated tank whose product is measured behind a pipe, a dead time", 60.0),
+    "unstable_reactor": ("Exothermic reactor at an unstable steady state", 30.0),
 }
 """By its name each plant's description and sampling time [s]."""
-_ROLES = ("states", "inputs", "disturbances", "outputs", "parameters")
+_ROLES = ("states", "hidden", "inputs", "disturbances", "outputs", "parameters")
 
 
 def model(name: str) -> FmuModel:

@@ -15,7 +15,7 @@ import numpy as np
 
 from controllers.dynamic_programming.grid import Grid
 from controllers.errors import ModelError, OptimumError
-from controllers.model import discretise, economic_cost
+from controllers.model import economic_cost
 from controllers.problem import DisturbanceLaw, PlantProblem
 from cosim.core.protocols import Array
 
@@ -255,7 +255,7 @@ class BellmanOperator:
         self.problem = problem
         self.deterministic = law.kind == "none" or not law.ranges.any()
         self.accuracy = accuracy
-        self._step = Elementwise(discretise(model, problem.sampling_time, accuracy.substeps))
+        self._step = Elementwise(plant.sampled(accuracy.substeps))
         self._cost = Elementwise(economic_cost(model))
         self._parameters = plant.parameters
 
@@ -455,7 +455,7 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
 
     before = np.full_like(x, np.inf)
     for substeps in (1, 2, 4, 8, 16, 32, 64, 128):
-        step = Elementwise(discretise(problem.model, problem.sampling_time, substeps))
+        step = Elementwise(plant.sampled(substeps))
         # A step that is too long may overflow; then the next one is tried.
         with np.errstate(all="ignore"):
             entries = step(x.T, u.T, d.T, plant.parameters)

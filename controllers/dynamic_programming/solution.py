@@ -18,7 +18,7 @@ from controllers.dynamic_programming.bellman import (
 from controllers.dynamic_programming.grid import Grid, Indices, graded_axis
 from controllers.dynamic_programming.minimisation import nelder_mead, scan
 from controllers.errors import OptimumError
-from controllers.model import discretise, economic_cost
+from controllers.model import economic_cost
 from controllers.problem import PlantProblem, Problem
 from cosim.core.protocols import Array
 
@@ -547,7 +547,7 @@ def simulate_policy(
     problem = plant.problem
     model = problem.model
     parameters = plant.parameters
-    step = Elementwise(discretise(model, problem.sampling_time, optimum.accuracy.substeps))
+    step = Elementwise(plant.sampled(optimum.accuracy.substeps))
     stage_cost = Elementwise(economic_cost(model))
     # Without the smooth parts: linear, as the policy is applied.
     grid = Grid(optimum.grid.axes)

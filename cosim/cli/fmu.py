@@ -16,7 +16,8 @@ MOST_ROWS = 1000
 fmu_app = typer.Typer(help="Look into an FMU, check it, build ours.")
 
 FmuFileArgument = Annotated[
-    str, typer.Argument(help="FMU file, or evaporator, evaporator_fmi3, reactor, tanks (shipped).")
+    str,
+    typer.Argument(help="FMU file, or the name of a shipped one, evaporator_fmi3 or tanks, say."),
 ]
 
 

@@ -27,7 +27,8 @@ def optimum(
     The policy is stored and serves as controller `optimal`. It is called J* where solution,
     refinement and long simulation agree within 0.05 % and no policy search is below; else
     it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
-    A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is.
+    A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is. One
+    disturbance may have a memory; its value is then a state, and no controller has the policy.
 
     Args:
         refine: Solve, refine the grid, simulate the policy; keep the certificate.
@@ -94,6 +95,11 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     path = path or store.keep(key, solution)
     certificate = solution.certificate
     why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
+    if plant.unseen:
+        why_not = (
+            f"its policy knows what {plant.unseen} was in the sample before, which no controller "
+            "is told: a bound from below"
+        )
     kind = "reference" if why_not else "optimum"
     figures = certificate or [
         GainEstimate("solution", solution.gain, solution.lower, solution.upper)

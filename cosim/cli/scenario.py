@@ -40,7 +40,7 @@ def show_scenario(
     """List the presets, or print a scenario with every field written out, as TOML.
 
     Args:
-        name: Preset, random-SEED or TOML file; none lists the presets.
+        name: Preset, random-SEED, random-coloured-SEED or TOML file; none lists the presets.
         seed: Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.
     """
     with cli.output(json) as out_:

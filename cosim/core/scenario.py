@@ -64,6 +64,8 @@ class MappingTable(Table):
     """One parameter per disturbance for its nominal value."""
     ranges: Names = ()
     """One parameter per disturbance for its half width or standard deviation."""
+    time_constant: Names | None = None
+    """One parameter per disturbance for the time constant of its filter, in s."""
 
 
 class ChangeTable(Table):
@@ -124,7 +126,13 @@ class PlantTable(Table):
 
 
 class DisturbanceTable(Table):
-    """Law of the disturbances, drawn anew each sample and held."""
+    """Law of the disturbances: drawn anew each sample and held, or drawn, filtered and held.
+
+    With a time constant T a disturbance is nominal + range·x_k, the draws w_k filtered:
+    x_k = φ x_{k−1} + √(1 − φ²) w_k with φ = exp(−h/T), from x = w in the first sample. Mean and
+    standard deviation are those of the draws, the autocorrelation over n samples is φⁿ. A uniform
+    law then names the law of the draws: the value goes beyond nominal ± range at times.
+    """
 
     law: Literal["uniform", "normal", "none"] = "none"
     """Uniform about the nominal value, normal about it, or that value itself."""
@@ -132,6 +140,13 @@ class DisturbanceTable(Table):
     """Nominal values, (p,)."""
     ranges: NonNegatives = ()
     """Half widths of the uniform law, standard deviations of the normal one, (p,)."""
+    time_constant: NonNegatives | None = None
+    """Time constants of the filters in s, (p,); 0, or left out: drawn anew each sample."""
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the disturbance of a sample depends on those of the samples before it."""
+        return self.law != "none" and any(self.time_constant or ())
 
 
 class BoundsTable(Table):
@@ -347,6 +362,11 @@ class Scenario(Shown, Table):
                 )
         if law != "none" and not (plant.mapping.law and law in plant.mapping.law_codes):
             raise ValueError(f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes")
+        if any(self.disturbance.time_constant or ()) and not plant.mapping.time_constant:
+            raise ValueError(
+                "disturbance.time_constant: needs plant.mapping.time_constant, a parameter of the "
+                "FMU for each disturbance"
+            )
         return self
 
     def _check_sizes(self) -> None:
@@ -358,8 +378,10 @@ class Scenario(Shown, Table):
             ("plant.mapping.initial_state", "state", True),
             ("plant.mapping.nominal", "disturbance", True),
             ("plant.mapping.ranges", "disturbance", True),
+            ("plant.mapping.time_constant", "disturbance", True),
             ("disturbance.nominal", "disturbance", without_law),
             ("disturbance.ranges", "disturbance", without_law),
+            ("disturbance.time_constant", "disturbance", True),
             ("bounds.state_lower", "state", False),
             ("bounds.state_upper", "state", False),
             ("bounds.action_lower", "action", False),
@@ -377,7 +399,7 @@ class Scenario(Shown, Table):
             "disturbance": len(self.plant.disturbances),
         }
         for field, kind, optional in rules:
-            entries = len(attrgetter(field)(self))
+            entries = len(attrgetter(field)(self) or ())
             if entries == sizes[kind] or (optional and not entries):
                 continue
             raise ValueError(
@@ -436,14 +458,23 @@ class Scenario(Shown, Table):
             "fmu": plant.fmu,
             "states": ", ".join(plant.states),
             "actions": ", ".join(plant.actions),
-            "disturbances": f"{', '.join(plant.disturbances)} ({self.disturbance.law})",
+            "disturbances": f"{', '.join(plant.disturbances)} ({self._law()})",
         }
+
+    def _law(self) -> str:
+        """The law of the disturbances in words."""
+        table = self.disturbance
+        if not table.coloured:
+            return table.law
+        constants = ", ".join(f"{constant:g}" for constant in table.time_constant or ())
+        return f"{table.law}, time constants {constants} s"
 
     @classmethod
     def load(cls, source: str | Path) -> Scenario:
         """Load a preset by name or a TOML file by path; raises ScenarioError.
 
-        `random-SEED` is the evaporator with the random errors of a seed, see `random_plant`.
+        `random-SEED` is the evaporator with the random errors of a seed, see `random_plant`;
+        `random-coloured-SEED` has time constants, too, see `random_coloured_plant`.
         A document with `extends = NAME_OR_PATH` states only what differs from another one.
         """
         document, origin = read(source)
@@ -497,12 +528,16 @@ class Scenario(Shown, Table):
     def hash(self) -> str:
         """First 16 hex digits of the SHA-256 of all that bears on results.
 
-        Left out: name, description, and the folder of a foreign FMU (its file name counts).
+        Left out: name, description, and the folder of a foreign FMU (its file name counts). Time
+        constants that are all zero are none.
         """
         document = self.to_dict()
         del document["name"]
         del document["description"]
         document["plant"]["fmu"] = Path(self.plant.fmu).name
+        if not any(self.disturbance.time_constant or ()):
+            document["disturbance"].pop("time_constant", None)
+            document["plant"]["mapping"].pop("time_constant", None)
         # One text for one content, whatever the order of a file's keys.
         canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
@@ -555,6 +590,14 @@ class Scenario(Shown, Table):
             self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
         )
 
+    @property
+    def memory(self) -> float:
+        """Longest time constant of the disturbances, in samples; 0 where each draw is new."""
+        table = self.disturbance
+        if not table.coloured:
+            return 0.0
+        return max(table.time_constant or ()) / self.sampling_time
+
     def saturate(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """Actions (…, m) clipped to the actuators' bounds."""
         return np.minimum(np.maximum(action, self.action_lower), self.action_upper)
@@ -583,8 +626,8 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
-RANDOM = re.compile(r"random-(0|[1-9]\d{0,8})")
-"""Name of the plant with random errors that a seed draws, `random-7` say."""
+RANDOM = re.compile(r"random-(coloured-)?(0|[1-9]\d{0,8})")
+"""Name of the plant that a seed draws: `random-7` say, with time constants `random-coloured-7`."""
 
 
 RANDOM_PARAMETERS = (
@@ -630,6 +673,37 @@ def random_plant(seed: int) -> dict[str, Any]:
     }
 
 
+COLOURED_SPREAD = 0.8
+"""Standard deviation of a disturbance with a memory, over that of the same plant without.
+
+A filtered uniform draw goes beyond the law's range: so the feed flow does not come near zero.
+"""
+
+
+def random_coloured_plant(seed: int) -> dict[str, Any]:
+    """The changes of `paper` that make the plant of `random_plant` with time constants.
+
+    Each disturbance has one with probability 3/4, log-uniform from 1 to 20 minutes, rounded to four
+    digits. They are drawn from a stream of their own, so that all else is that of `random-SEED`,
+    but for the standard deviations, which are 0.8 times as large.
+    """
+    rng = np.random.default_rng([seed, 1])
+    plant = random_plant(seed)
+    disturbance = plant["disturbance"]
+    time_constants = []
+    for _ in disturbance["nominal"]:
+        has_memory = rng.uniform() < 0.75
+        seconds = 60.0 * 20.0 ** rng.uniform()
+        time_constants.append(_four_digits(seconds) if has_memory else 0.0)
+    ranges = [_four_digits(COLOURED_SPREAD * value) for value in disturbance["ranges"]]
+    return plant | {
+        "name": f"random-coloured-{seed}",
+        "description": f"The evaporator with the random errors and the time constants of its "
+        f"disturbances that seed {seed} draws; the controller is not told",
+        "disturbance": disturbance | {"ranges": ranges, "time_constant": time_constants},
+    }
+
+
 def _four_digits(value: float) -> float:
     """A number rounded to four significant digits."""
     return float(f"{value:.4g}")
@@ -639,7 +713,7 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     """Read a preset or file and what it extends.
 
     Args:
-        source: a preset's name, `random-SEED`, or the path of a TOML file.
+        source: a preset's name, `random-SEED`, `random-coloured-SEED`, or the path of a TOML file.
         seen: files that led here.
 
     Returns:
@@ -655,7 +729,8 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     random = RANDOM.fullmatch(str(source))
     if random is not None:
         paper, _ = read("paper")
-        return paper | random_plant(int(random[1])), f"preset '{source}'"
+        draw = random_coloured_plant if random[1] else random_plant
+        return paper | draw(int(random[2])), f"preset '{source}'"
     path = Path(source)
     origin = f"scenario file '{source}'"
     if str(source) in presets():
@@ -664,7 +739,8 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     elif path.suffix != ".toml" and len(path.parts) < 2:
         raise ScenarioError(
             f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
-            f"{', '.join(presets())} and random-SEED, or give the path of a TOML file"
+            f"{', '.join(presets())}, random-SEED and random-coloured-SEED, or give the path of a "
+            "TOML file"
         )
     document = read_toml(path, origin, ScenarioError)
     place = path.resolve()

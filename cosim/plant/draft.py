@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from cosim.core.errors import PlantError
 from cosim.core.protocols import Array
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import Scenario, presets
 from cosim.core.validation import suggestion
 from cosim.plant.fmi import SHIPPED_FMUS, UnpackedFmu, number, unpack
 from cosim.plant.fmu_plant import FmuPlant
@@ -32,6 +32,12 @@ NO_NOISE = (
 HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
+PARAMETERS_OF_NOISE = {
+    "nominal": "_nominal",
+    "ranges": "_range",
+    "time_constant": "_time_constant",
+}
+"""Field of the scenario's disturbances, and what our own plants call its parameter after NAME."""
 COSTS = ("cost", "loss", "objective")
 INPUTS_SHOWN = 12
 """Inputs that a remark names at most."""
@@ -169,7 +175,7 @@ def draft_scenario(
     archive = unpack(fmu)
     for refusal in refusals(archive):
         raise PlantError(refusal)
-    roles = guess_roles(archive, states, actions, stage_cost)
+    roles = guess_roles(archive, states or _known_states(fmu), actions, stage_cost)
     document = first_document(fmu, archive, roles, sampling_time, action)
     document, remarks = _with_what_was_seen(document, archive)
     document, more_remarks = _with_starts(document, archive, state)
@@ -196,6 +202,18 @@ def draft_scenario(
             document["plant"]["fmu"] = Path(path).as_posix()
     remarks = _remarks(document, archive, units) | remarks | more_remarks
     return with_remarks(tomli_w.dumps(document), remarks)
+
+
+def _known_states(fmu: str | Path) -> tuple[str, ...]:
+    """The states that a preset on this shipped FMU has: others may be hidden; () if there is none.
+
+    The controller's model, which a draft names for a shipped FMU, has them.
+    """
+    for name in presets() if str(fmu) in SHIPPED_FMUS else ():
+        plant = Scenario.load(name).plant
+        if plant.fmu == str(fmu):
+            return plant.states
+    return ()
 
 
 def first_document(
@@ -230,6 +248,9 @@ def first_document(
         disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
         for field in ("nominal", "ranges"):
             disturbance[field] = [start_value(archive, name) for name in mapping[field]]
+        time_constants = [start_value(archive, name) for name in mapping.get("time_constant", ())]
+        if any(time_constants):
+            disturbance["time_constant"] = time_constants
     is_shipped = str(fmu) in SHIPPED_FMUS
     return {
         "schema": 1,
@@ -456,6 +477,11 @@ def _remarks(
         remarks["controller"] = "CHECK: the plant as it starts; it can start nowhere else"
     if document["disturbance"]["law"] == "none":
         remarks["disturbance"] = f"CHECK: {NO_NOISE}"
+    elif "time_constant" in plant["mapping"] and "time_constant" not in document["disturbance"]:
+        remarks["disturbance"] = (
+            "CHECK: drawn anew each sample; what disturbs a plant mostly has a memory, in s for "
+            f"each disturbance: time_constant = {[300.0] * len(plant['disturbances'])}"
+        )
     if "model" not in document["controller"]:
         remarks["controller"] += '; add model = "my_plant:model", a model in CasADi'
     return remarks
@@ -583,7 +609,7 @@ def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
         table["law"] = "law"
         table["law_codes"] = codes
     # Means and ranges of all disturbances, or of none: a scenario has an entry for each.
-    for field, suffix in (("nominal", "_nominal"), ("ranges", "_range")):
+    for field, suffix in PARAMETERS_OF_NOISE.items():
         parameters = [f"{name}{suffix}" for name in noise]
         if parameters and all(is_parameter(name, REALS) for name in parameters):
             table[field] = parameters

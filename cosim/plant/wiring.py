@@ -205,6 +205,13 @@ class Wiring:
         add("plant.mapping.law", mapping.law, codes)
         add("plant.mapping.nominal", mapping.nominal, law.nominal)
         add("plant.mapping.ranges", mapping.ranges, law.ranges)
+        if law.time_constant is not None:
+            add("plant.mapping.time_constant", mapping.time_constant, law.time_constant)
+        else:
+            # Left out they are 0, whatever the FMU's own are; an FMU that has none draws anew.
+            for name in mapping.time_constant or ():
+                if self._fmu.variable(name) is not None:
+                    add("plant.mapping.time_constant", name, [0.0])
         for name, value in plant.parameters.items():
             add("plant.parameters", name, [value])
         for place in self.seeds:

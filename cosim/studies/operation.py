@@ -46,7 +46,9 @@ WINDOW = 100
 SHIFT = 480
 """Samples in a row, eight hours of a minute each, that are compared with those of the start."""
 SHIFT_PARTS = 8
-"""Parts of a shift, whose means are the values of its test."""
+"""Parts of a shift, whose means are the values of its test; fewer where noise has a long memory."""
+PART_MEMORIES = 10
+"""Time constants of the noise that a part has at least: neighbours then correlate by 0.06."""
 SHIFT_LEVEL = 0.05
 """Level of the test, of all shifts of a run together."""
 OPERATION_METRICS = [
@@ -129,7 +131,9 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
             if k + 1 not in marks:
                 continue
             processor_seconds[k + 1] = process_time() - clock
-            metrics = operation_metrics(k + 1, before, cost, violating, first_change)
+            metrics = operation_metrics(
+                k + 1, before, cost, violating, first_change, run.scenario.memory
+            )
             metrics["updates"] = float(updates)
             metrics["model_samples"] = float(getattr(loop.algorithm, "model_samples", 0))
             rows.append(LogRow(metrics, loop.parameters))
@@ -146,7 +150,12 @@ def _cost_of_the_start(run: TrainingRun, plant: FmuPlant) -> Array:
 
 
 def operation_metrics(
-    samples: int, before: Array, cost: Array, violating: Array, first_change: int
+    samples: int,
+    before: Array,
+    cost: Array,
+    violating: Array,
+    first_change: int,
+    memory: float = 0.0,
 ) -> dict[str, float]:
     """What the first samples of a run in operation cost.
 
@@ -156,6 +165,7 @@ def operation_metrics(
         cost: Cost (K,) of each sample.
         violating: Whether each sample violates a bound, (K,).
         first_change: Number of samples before the first one with another θ; 0 while θ stays.
+        memory: Longest time constant of the noise, in samples (`Scenario.memory`).
 
     Returns:
         `samples`; `J`, the mean cost of all of them; `first_change`, NaN while θ stays; of the
@@ -177,7 +187,7 @@ def operation_metrics(
         metrics["violating"] = float(violating[since].mean())
     if first_change > 0:
         metrics["first_change"] = float(first_change)
-        shifts = compare_shifts(before[since], cost[since])
+        shifts = compare_shifts(before[since], cost[since], memory)
         metrics["dearer"] = shifts.higher
         metrics["excess"] = shifts.largest_excess
     return metrics
@@ -210,31 +220,40 @@ class ShiftComparison(NamedTuple):
     largest_excess: float
 
 
-def compare_shifts(before: Array, cost: Array) -> ShiftComparison:
+def compare_shifts(before: Array, cost: Array, memory: float = 0.0) -> ShiftComparison:
     """Compare costs of the same noise, shift by shift of `SHIFT` samples.
 
     A shift's cost is higher where the excess of its `SHIFT_PARTS` is above zero by a one-sided
-    t test at `SHIFT_LEVEL` (Bonferroni over the shifts). Samples behind the last whole shift do
+    t test at `SHIFT_LEVEL` (Bonferroni over the shifts). The test takes the parts as independent:
+    where the noise has a memory they are longer, and fewer. Samples behind the last whole shift do
     not count.
 
     Args:
         before: cost of each sample that is compared with, (K,).
         cost: cost of each sample, (K,); infinite after a divergence.
+        memory: longest time constant of the noise, in samples.
 
     Returns:
-        The comparison; NaN where there is no whole shift.
+        The comparison; NaN where there is no whole shift. `higher` is NaN where a shift is too
+        short for two independent parts.
     """
     n_shifts = len(cost) // SHIFT
     if not n_shifts:
         return ShiftComparison(np.nan, np.nan)
+    n_parts = SHIFT_PARTS
+    # Halved until a part is long enough, so that the parts of a shift stay equal.
+    while n_parts > 1 and SHIFT / n_parts < PART_MEMORIES * memory:
+        n_parts //= 2
     whole_shifts = slice(0, n_shifts * SHIFT)
     # Of infinite costs a test has no value: they count by their mean.
     with np.errstate(invalid="ignore", divide="ignore"):
         excess = cost[whole_shifts] - before[whole_shifts]
         # Means of parts are nearly independent where neighbouring samples are not.
-        parts = excess.reshape(n_shifts, SHIFT_PARTS, -1).mean(axis=2)
+        parts = excess.reshape(n_shifts, n_parts, -1).mean(axis=2)
+        mean_excess = parts.mean(axis=1)
+        if n_parts == 1:
+            return ShiftComparison(np.nan, float(mean_excess.max()))
         p = ttest_1samp(parts, 0.0, axis=1, alternative="greater").pvalue
-    mean_excess = parts.mean(axis=1)
     # Bonferroni: one shift in twenty runs without an excess is found to be higher, not in each.
     is_significant = p < SHIFT_LEVEL / n_shifts
     is_higher = is_significant | (mean_excess == np.inf)

@@ -2,27 +2,13 @@
 #ifndef OUTPUTS_H
 #define OUTPUTS_H
 
-#include "disturbance.h"
+#include "deviations.h"
 #include "equations.h"
 #include "instance.h"
 #include "states.h"
 
-/* The disturbances of the sample: nominal, or drawn anew in each and held. */
-static void realise(State *state) {
-    double *v = state->v;
-    const int stochastic = v[VR_stochastic] != 0.0;
-    if (stochastic && !state->model.drawn) {
-        const uint32_t key[2] = {(uint32_t)v[VR_seed], (uint32_t)v[VR_seedHigh]};
-        const double law = v[VR_law_number] != 0.0 ? v[VR_law_number] : v[VR_law];
-        standard_draws(key, state->sample, (int)law, state->model.draws);
-        state->model.drawn = 1;
-    }
-    for (int i = 0; i < N_DISTURBANCES; i++) {
-        v[DISTURBANCES[i].realised] = v[DISTURBANCES[i].nominal];
-        if (stochastic)
-            v[DISTURBANCES[i].realised] += v[DISTURBANCES[i].range] * state->model.draws[i];
-    }
-}
+/* All that is held in a sample. */
+static void realise(State *state) { realise_disturbances(state); }
 
 static void start_model(State *state) {
     for (int i = 0; i < N_STATES; i++)

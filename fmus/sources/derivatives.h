@@ -16,7 +16,7 @@ static DisturbancePartials disturbance_partials(const State *state, int i) {
     partials.source[0] = override ? DISTURBANCES[i].given : DISTURBANCES[i].nominal;
     partials.source[1] = DISTURBANCES[i].range;
     partials.factor[0] = 1.0;
-    partials.factor[1] = stochastic ? state->model.draws[i] : 0.0;
+    partials.factor[1] = stochastic ? state->model.deviations[i] : 0.0;
     return partials;
 }
 

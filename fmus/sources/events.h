@@ -18,9 +18,16 @@ static double next_event_time(const State *state) {
 static Status update_discrete_state(Instance *instance, const char *function) {
     State *state = &instance->state;
     const Grid grid = model_grid(state);
+    const int64_t sample = sample_of(grid, locate(grid, state->v[VR_time]).point);
     const Status status = check_stop_time(instance, function, state->v[VR_time]);
     if (status != OK) return status;
-    move_to_sample(state, sample_of(grid, locate(grid, state->v[VR_time]).point));
+    if (!within_reach(state, sample))
+        return report(instance, ERROR,
+                      "%s: disturbances with a time constant go forwards from sample %lld, by at "
+                      "most %d samples at once; this is sample %lld.",
+                      function, (long long)state->model.filtered, MAX_SAMPLES_PER_EVENT,
+                      (long long)sample);
+    move_to_sample(state, sample);
     return OK;
 }
 

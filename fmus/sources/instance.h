@@ -38,7 +38,7 @@ static const char *const CATEGORY_NAMES[N_CATEGORIES] = {
     "logEvents", "logStatusWarning", "logStatusDiscard", "logStatusError"};
 
 #define STATE_MAGIC LAYOUT_DIGEST
-#define STATE_VERSION 2
+#define STATE_VERSION 3
 
 typedef struct {
     uint64_t magic;

@@ -5,8 +5,10 @@
 #include "disturbance.h"
 
 typedef struct {
-    int64_t drawn;                  /* whether `draws` is that of the sample in force */
-    double draws[2 * N_BLOCKS + 1]; /* one more: C has no empty array */
+    int64_t drawn;    /* whether `deviations` is that of the sample in force */
+    int64_t begun;    /* whether the filters have begun, in the first sample of the simulation */
+    int64_t filtered; /* the sample that `deviations` belongs to, once they have begun */
+    double deviations[2 * N_BLOCKS + 1]; /* one more: C has no empty array */
 } ModelState;
 
 /* Interfaces beside co-simulation. */

@@ -3,6 +3,7 @@
 #ifndef SAMPLED_H
 #define SAMPLED_H
 
+#include "deviations.h"
 #include "grid.h"
 #include "instance.h"
 
@@ -28,10 +29,11 @@ static void move_to_sample(State *state, int64_t sample) {
 static int plausible_model(const State *state) {
     for (unsigned vr = 0; vr < N_VARIABLES; vr++)
         if (VARIABLES[vr].type != REAL && state->v[vr] != floor(state->v[vr])) return 0;
-    return 1;
+    return within_reach(state, state->sample) && plausible_deviations(state);
 }
 
-/* After a state came from bytes: what can be computed anew is not trusted. */
+/* After a state came from bytes: what can be computed anew is not trusted. Filtered deviations cannot:
+ * they stay, where the filters have come to the sample in force. */
 static void distrust(State *state) {
     state->outputs_current = 0;
     state->model.drawn = 0;
@@ -43,6 +45,7 @@ static void refresh(State *state) {
     if (state->mode & (INSTANTIATED | INITIALIZATION)) {
         const Grid grid = model_grid(state);
         state->model.drawn = 0;
+        state->model.begun = 0;
         state->sample = sample_of(grid, locate(grid, state->v[VR_time]).point);
         start_model(state);
     }

@@ -9,10 +9,10 @@
 #define FMI3_FUNCTION_PREFIX evaporator_
 #endif
 
-#define MODEL_TOKEN "{eea8899d-99f8-5362-9e5b-f15484eab7aa}"
+#define MODEL_TOKEN "{f2f45220-3da9-5a68-b4ab-2d7eb9d508a9}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
-#define LAYOUT_DIGEST UINT64_C(0x9bf4eee7a86d70a1)
+#define LAYOUT_DIGEST UINT64_C(0x9af9dc9b348a14f3)
 
 enum {
     VR_time = 0,
@@ -78,7 +78,11 @@ enum {
     VR_UA2_present = 60,
     VR_saturate = 61,
     VR_law_number = 62,
-    N_VARIABLES = 63
+    VR_X1_time_constant = 63,
+    VR_F1_time_constant = 64,
+    VR_T1_time_constant = 65,
+    VR_T200_time_constant = 66,
+    N_VARIABLES = 67
 };
 
 typedef enum { REAL, BOOLEAN, LAW, SEED, SEED_HIGH, LAW_NUMBER } VariableType;
@@ -156,6 +160,10 @@ static const VariableInfo VARIABLES[N_VARIABLES] = {
     {"UA2_present", REAL, OUTPUT, 0.0, 0.0, 1000.0, 6.84},
     {"saturate", BOOLEAN, FIXED, 0.0, 0.0, 1.0, 1.0},
     {"law_number", LAW_NUMBER, FIXED, 0.0, 0.0, 2.0, 1.0},
+    {"X1_time_constant", REAL, FIXED, 0.0, 0.0, 1000000.0, 300.0},
+    {"F1_time_constant", REAL, FIXED, 0.0, 0.0, 1000000.0, 300.0},
+    {"T1_time_constant", REAL, FIXED, 0.0, 0.0, 1000000.0, 300.0},
+    {"T200_time_constant", REAL, FIXED, 0.0, 0.0, 1000000.0, 300.0},
 };
 
 #endif

@@ -12,12 +12,12 @@ static const unsigned START_REFERENCES[N_STATES] = { {%- for x in states %}VR_{{
 
 /* The last row is none: C has no empty array. */
 static const struct {
-    int realised, nominal, range;
+    int realised, nominal, range, time_constant;
 } DISTURBANCES[N_DISTURBANCES + 1] = {
 {% for d in drawn %}
-    {VR_{{ d }}, VR_{{ d }}_nominal, VR_{{ d }}_range},
+    {VR_{{ d }}, VR_{{ d }}_nominal, VR_{{ d }}_range, VR_{{ d }}_time_constant},
 {% endfor %}
-    {0, 0, 0},
+    {0, 0, 0, 0},
 };
 
 #endif

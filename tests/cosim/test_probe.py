@@ -4,6 +4,7 @@ import fmpy
 import numpy as np
 import pytest
 
+import fmus
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.errors import CapabilityError, PlantError
 from cosim.plant.probe import OutputKind, Restart, probe
@@ -249,7 +250,7 @@ def test_a_plant_with_noise_of_its_own_is_read_in_the_order_that_fmi_allows(made
 
 
 def test_our_own_fmus_are_seen_as_they_are():
-    for name in ("evaporator", "evaporator_fmi3", "reactor", "tanks"):
+    for name in (*fmus.NAMES, *fmus.PLANTS):
         report = probe(name)
         assert (report.outputs, report.restart) == ("before-step", Restart.RESET), name
         assert report.snapshots, name

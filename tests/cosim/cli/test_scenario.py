@@ -43,12 +43,14 @@ def test_the_evaporators_draft_is_the_paper_but_for_what_nobody_could_know(cosim
     assert code == 0 and json.loads(out)["failures"] == 0
 
 
-@pytest.mark.parametrize("name", ["reactor", "tanks"])
+@pytest.mark.parametrize("name", ["reactor", "tanks", "dead-time"])
 def test_a_plants_draft_has_the_roles_that_its_scenario_has(cosim, tmp_path, name):
-    code, out, _ = cosim("scenario", "init", name, "--out", "draft.toml", "--json")
+    known = Scenario.load(name)
+    code, out, _ = cosim("scenario", "init", known.plant.fmu, "--out", "draft.toml", "--json")
     assert code == 0
     assert json.loads(out)["plant"]["states"]
-    drafted, known = Scenario.load(tmp_path / "draft.toml"), Scenario.load(name)
+    assert "a memory" in (tmp_path / "draft.toml").read_text()
+    drafted = Scenario.load(tmp_path / "draft.toml")
     for field in ("states", "actions", "disturbances", "stage_cost", "mapping"):
         assert getattr(drafted.plant, field) == getattr(known.plant, field), field
     assert drafted.sampling_time == known.sampling_time

@@ -1,5 +1,6 @@
 import numpy as np
 import pandas as pd
+from scipy.signal import lfilter
 
 from cosim import Study, study
 from cosim.studies.operation import (
@@ -21,6 +22,21 @@ def test_noise_alone_makes_no_shift_dearer_and_a_dearer_one_is_found(rng):
     cost[0, 480:960] += 25.0
     number, excess = compare_shifts(before[0], cost[0])
     assert number == 1 and abs(excess - 25.0) < 10.0
+
+
+def test_noise_with_a_memory_is_compared_in_longer_parts(rng):
+    memory = 24.0
+    phi = np.exp(-1.0 / memory)
+    shape = (200, 3 * SHIFT)
+    cost = lfilter([np.sqrt(1 - phi**2)], [1.0, -phi], rng.normal(0.0, 50.0, shape))
+    before = np.zeros(shape)
+
+    def called(**told):
+        lives = zip(before, cost, strict=True)
+        return np.mean([compare_shifts(*pair, **told)[0] > 0 for pair in lives])
+
+    assert called(memory=memory) < 0.09 < called()  # 5 % of lives, and 13 %
+    assert np.isnan(compare_shifts(before[0], cost[0], memory=100.0)[0])
 
 
 def test_a_run_that_diverged_is_dearer_in_each_shift_since():

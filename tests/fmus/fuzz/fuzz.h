@@ -6,7 +6,7 @@
 #include <float.h>
 #include <time.h>
 
-enum { POOL = 4, MAX_VALUES = 8 };
+enum { POOL = 4, MAX_VALUES = N_STATES > 8 ? N_STATES : 8 };
 
 static uint64_t random_state;
 static int messages;

@@ -31,13 +31,13 @@ FLOOR = 1e-12
 class ActorCriticConfiguration(Configuration):
     """Hyperparameters of the actor-critic."""
 
-    exploration_probability: ExplorationProbability = 0.1
+    exploration_probability: ExplorationProbability = 0.0
     batch_size: Count = Field(240, description="samples per step of θ, all at one θ")
     forgetting: float = Field(
-        0.75,
+        0.95,
         ge=0,
         lt=1,
-        description="weight of a batch in the critic, relative to the next one",
+        description="weight of a batch in the critic, relative to the next one at the same θ",
     )
     prediction_errors: Count = Field(
         1000,
@@ -503,11 +503,11 @@ def trust_region_fit(
     def length(step: Vector) -> float:
         return float(np.sqrt(step @ region @ step))
 
-    # Where J has no curvature, only the region bounds the step.
-    least = FLOOR * float(curvatures.max()) + np.finfo(float).tiny
-    multiplier = least
-    if excess(least) > 0:
-        multiplier = brentq(excess, least, least + np.linalg.norm(slopes) / radius, rtol=FLOOR)
+    # Where J has no curvature, only the region bounds the step, by this multiplier.
+    steepest = float(np.linalg.norm(slopes)) / radius
+    multiplier = FLOOR * max(float(curvatures.max()), steepest) + np.finfo(float).tiny
+    if excess(multiplier) > 0:
+        multiplier = brentq(excess, multiplier, multiplier + steepest, rtol=FLOOR)
     dual = region @ vectors
     convex = (dual * curvatures) @ dual.T
     # α = 2 makes the metric H + μR that of dᵀ(H + μR)d/2.

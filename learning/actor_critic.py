@@ -171,14 +171,19 @@ class ActorCritic(Algorithm):
         # Errors of the nominal model at the actions that were applied.
         applied = self._model(states, batch["a"])
         prediction_errors = batch["next_s"] - applied.following
-        for error in prediction_errors:
-            self._errors.add(error)
         if not self._has_coordinates:
             self._begin(states, prediction_errors)
-
-        # The critic: the cost of the policy's action, and what is expected after it.
         at_policy = self._model(states, batch["policy"])
         following = at_policy.following
+        # An advantage that corrects the model needs a critic of the plant, not of the model.
+        if self.strategy.probability > 0:
+            systematic = linear_part(states, prediction_errors)
+            following = following + systematic
+            prediction_errors = prediction_errors - systematic
+        for error in prediction_errors:
+            self._errors.add(error)
+
+        # The critic: the cost of the policy's action, and what is expected after it.
         errors = self._errors.values
         penalty = ExpectedPenalty(self.scenario.state_penalty, errors)
         greedy_cost = batch["cost"] - np.einsum("km,km->k", at_policy.cost_gradient, deviation)
@@ -472,6 +477,15 @@ class DifferentialValue:
         self._matrix = state["matrix"]
         self._moment = state["moment"]
         self.weights = state["weights"]
+
+
+def linear_part(states: Matrix, errors: Matrix) -> Matrix:
+    """The part of errors (K, n) that is affine in the states (K, n), by least squares, (K, n)."""
+    spread = states.std(axis=0)
+    z = (states - states.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    features = np.hstack([np.ones((len(z), 1)), z])
+    part: Matrix = features @ np.linalg.lstsq(features, errors)[0]
+    return part
 
 
 def trust_region_fit(

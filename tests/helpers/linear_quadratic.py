@@ -99,7 +99,7 @@ class LinearQuadratic:
         return Parameters.naive(self.problem)
 
     def plant(self, noise=0.0, seed=0, constant=0.0, gain=1.0):
-        """The plant: `constant` is added to each sample's cost, `gain` is its B over the model's."""
+        """The plant: `constant` is added to each sample's cost, `gain` is its B over the task's."""
         return _Plant(self, noise, seed, constant, gain)
 
 

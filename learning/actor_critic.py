@@ -18,6 +18,7 @@ from cosim.core.scenario import Penalty, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, ExplorationProbability, Positive
+from learning.errors import DivergenceError
 from learning.prediction_errors import PredictionErrors, SortedErrors, expected_penalties
 from learning.q_learning import ValueConfiguration, prior_deviation
 from learning.step import ConstrainedStep, Fit, policy_gradient_fit
@@ -188,6 +189,8 @@ class ActorCritic(Algorithm):
         penalty = ExpectedPenalty(self.scenario.state_penalty, errors)
         greedy_cost = batch["cost"] - np.einsum("km,km->k", at_policy.cost_gradient, deviation)
         reward = greedy_cost + penalty.value(following)
+        if not np.isfinite(reward).all():
+            raise DivergenceError("the costs or the predictions are not finite")
         td_errors = self._critic.fit(states, following, errors, reward)
 
         # Slope and curvature of the expected next value, in the state and then in the action.
@@ -209,7 +212,7 @@ class ActorCritic(Algorithm):
         action_curvature = cost_curvature + value_curvature
         hessian = np.einsum("kmi,kmn,knj->ij", jacobian, action_curvature, jacobian) / count
 
-        # What the realised next states say of the slope beyond the model.
+        # What realised costs and next states say of the slope beyond the model.
         innovation = np.einsum("kn,kn->k", slope, prediction_errors - mean_error)
         terms = np.mean(np.sum(cost_slope**2 + value_slope**2, axis=1))
         features = np.einsum("kmi,km->ki", jacobian, deviation / self._range)

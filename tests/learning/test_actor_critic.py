@@ -5,12 +5,15 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 from controllers.rti import RtiNmpc
+from controllers.theta import Parameters
 from cosim.core.scenario import Penalty
 from learning import ActorCritic
 from learning.actor_critic import DifferentialValue, ExpectedPenalty, trust_region_fit
+from learning.algorithm import Transition
+from learning.errors import DivergenceError
 from learning.exploration import Strategy
 from tests.helpers.linear_quadratic import ACTION_COST, STATE_COST
-from tests.helpers.training import looped
+from tests.helpers.training import Carrier, looped
 
 NOISE = 0.5
 
@@ -91,15 +94,44 @@ def test_a_smaller_radius_makes_a_smaller_change_of_the_action(linear_quadratic)
     assert 1e-4 < change <= 1e-3 * (1 + 1e-9)
 
 
-def test_saturation_does_not_bias_the_deviation(scenario, rng):
-    """At a saturated action the noise has a mean; a level of cost must not look like a slope."""
-    configuration = ActorCritic.Configuration.from_dict({"exploration_probability": 1.0})
+class Solution:
+    def __init__(self, action, size):
+        self.action, self.policy_jacobian = action, np.zeros((2, size))
+
+
+def saturated(problem, scenario, rng, cost=6000.0):
+    """A rule whose open batch lacks one sample; each explores at a saturated action."""
+    configuration = ActorCritic.Configuration.from_dict(
+        {"parametrisation": "paper", "batch_size": 401, "exploration_probability": 1.0}
+    )
+    carrier = Carrier(Parameters.naive(problem))
     strategy = Strategy(configuration, scenario)
-    policies = np.tile([399.0, 200.0], (4000, 1))
-    wanted = np.array([strategy(a, rng) for a in policies])
-    deviation = np.clip(wanted, scenario.action_lower, scenario.action_upper) - policies
-    assert deviation[:, 0].mean() < -1.0
-    assert deviation.mean(axis=0) == pytest.approx(strategy.bias(policies)[0], abs=0.3)
+    actor = ActorCritic(carrier, scenario, configuration, 401, strategy, rng)
+    solution = Solution(np.array([399.0, 200.0]), carrier.theta.size)
+    for number in range(400):
+        a = np.clip(strategy(solution.action, rng), scenario.action_lower, scenario.action_upper)
+        s = scenario.initial_state + rng.normal(size=(2, 2))
+        before = (number, s[0], a, True, solution, solution, cost, cost)
+        actor.observe(Transition(*before, s[1], 0.0, solution, None, None))
+    return actor
+
+
+def test_saturation_does_not_bias_the_deviation(problem, scenario, rng):
+    """At a saturated action the noise has a mean; a level of cost must not look like a slope."""
+    actor = saturated(problem, scenario, rng)
+    raw_mean = -5.0 * 0.3  # what the noise would average to, roughly
+    assert abs(actor._deviation()[:400, 0].mean()) < 0.25 * abs(raw_mean)
+
+
+def test_costs_that_are_not_finite_are_a_divergence(problem, scenario, rng):
+    actor = saturated(problem, scenario, rng, cost=np.nan)
+    solution = Solution(np.array([399.0, 200.0]), actor.controller.theta.size)
+    s, a = scenario.initial_state, solution.action
+    sample = Transition(
+        400, s, a, False, solution, solution, 0.0, 0.0, s, 0.0, solution, None, None
+    )
+    with pytest.raises(DivergenceError, match="not finite"):
+        actor.observe(sample)
 
 
 def chain(rng, count=40_000):

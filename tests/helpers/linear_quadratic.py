@@ -81,10 +81,10 @@ class LinearQuadratic:
         self.B = np.array(step([0.0, 0.0], [1.0], none, none)).reshape(2, 1)
         self.P, self.K = self.riccati(DISCOUNT)
 
-    def riccati(self, discount):
+    def riccati(self, discount, gain=1.0):
         """P and K of min Σ γᵏ ℓ: V = sᵀPs, u = −Ks, by SciPy's Riccati solver."""
         root = np.sqrt(discount)
-        A, B = root * self.A, root * self.B
+        A, B = root * self.A, root * gain * self.B
         P = solve_discrete_are(A, B, STATE_COST, ACTION_COST)
         return P, np.linalg.solve(ACTION_COST + B.T @ P @ B, B.T @ P @ A)
 
@@ -98,14 +98,15 @@ class LinearQuadratic:
         """A θ to start from: identity Hessians and an offset model."""
         return Parameters.naive(self.problem)
 
-    def plant(self, noise=0.0, seed=0, constant=0.0):
-        """The plant; `constant` is added to the cost of each sample."""
-        return _Plant(self, noise, seed, constant)
+    def plant(self, noise=0.0, seed=0, constant=0.0, gain=1.0):
+        """The plant: `constant` is added to each sample's cost, `gain` is its B over the task's."""
+        return _Plant(self, noise, seed, constant, gain)
 
 
 class _Plant:
-    def __init__(self, task, noise, seed, constant):
+    def __init__(self, task, noise, seed, constant, gain):
         self.scenario, self._task, self._constant = task.scenario, task, constant
+        self._B = gain * task.B
         self._noise, self._rng = noise, np.random.default_rng(seed)
 
     def reset(self, seed=0):
@@ -118,5 +119,5 @@ class _Plant:
         cost = float(s @ STATE_COST @ s + a @ ACTION_COST @ a)
         cost += self._constant
         w = self._noise * self._rng.standard_normal(2)
-        self._s = self._task.A @ s + self._task.B @ a + w
+        self._s = self._task.A @ s + self._B @ a + w
         return Step(self._s, cost, 0.0, np.zeros(0))

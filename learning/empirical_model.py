@@ -5,8 +5,8 @@ parameters are c times their value larger, and its disturbances c times their ma
 size of the error that disturbances in proportion to their magnitudes would make. c and W are
 estimated from transitions by Bayesian generalised least squares, in Gauss-Newton steps since y is
 not linear in c; the width of the prior of W's slopes is the one of greatest evidence (MacKay 1992).
-The residuals r are kept and drawn anew. The model knows no parameter of the plant and no law of its
-disturbances.
+Errors persist where disturbances do: r₊ = φ r + e. The residuals e are kept and drawn anew. The
+model knows no parameter of the plant and no law of its disturbances.
 """
 
 from __future__ import annotations
@@ -30,8 +30,12 @@ from cosim.core.protocols import Array
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, NonNegative, Positive, Share
 
+Rows = NDArray[np.intp]
+"""Numbers of samples."""
 INTEGRATION_ERROR = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
+LARGEST_PERSISTENCE = 0.99
+"""Largest φ: errors that last for 100 samples; longer ones are the mean's."""
 BLOCK = 250
 """Rows of the fit that are factored at a time: as many as fit in a processor's cache."""
 
@@ -56,6 +60,11 @@ class EmpiricalModelConfiguration(Configuration):
     smallest_error_size: Positive = Field(
         0.1,
         description="least h, as a share of its value at the reference",
+    )
+    persistence_doubt: NonNegative = Field(
+        3.0,
+        description="standard deviations that the errors' lag-one autocorrelation must exceed, or "
+        "errors count as independent in time",
     )
     fit_rounds: Count = Field(
         6,
@@ -224,7 +233,8 @@ class EmpiricalModel:
         centre, unit: by which inputs are standardised, (n+m,).
         mean: c, then W row by row for the inputs (1, s, a), standardised, (p + K(1+n+m),).
         covariance: that of the posterior of `mean`.
-        residuals: r, (M, K), of mean zero.
+        residuals: e, (M, K), of mean zero; r itself where it does not persist.
+        persistence: φ, the share of r that the next sample keeps, (K,).
     """
 
     features: Features
@@ -233,6 +243,7 @@ class EmpiricalModel:
     mean: Array
     covariance: Array
     residuals: Array
+    persistence: Array
 
     @classmethod
     def fit(
@@ -241,20 +252,24 @@ class EmpiricalModel:
         inputs: Array,
         outputs: Array,
         settings: EmpiricalModelConfiguration,
-        earlier_residuals: Array | None = None,
+        earlier: EmpiricalModel | None = None,
     ) -> EmpiricalModel:
-        """Estimate from transitions.
+        """Estimate from consecutive transitions.
 
         Args:
             features: the nominal model.
             inputs: (s, a), (M, n+m).
             outputs: (s₊, ℓ), (M, K).
             settings: prior and rounds.
-            earlier_residuals: of an earlier estimate, (·, K); they are kept beside the new ones.
+            earlier: an earlier estimate, whose residuals are kept beside the new ones, and whose φ
+                counts as if they had been seen here.
         """
         p = features.n_parameters
-        if earlier_residuals is None:
-            earlier_residuals = np.empty((0, features.n_outputs))
+        earlier_residuals = np.empty((0, features.n_outputs))
+        earlier_persistence = np.zeros(features.n_outputs)
+        if earlier is not None:
+            earlier_residuals = earlier.residuals
+            earlier_persistence = earlier.persistence
         # Standardised inputs: one width of the prior serves all slopes.
         centre = inputs.mean(axis=0)
         unit = inputs.std(axis=0)
@@ -271,31 +286,51 @@ class EmpiricalModel:
         residuals = residuals - residuals.mean(axis=0)
         least_variance = INTEGRATION_ERROR**2 * ((y / h) ** 2).mean(axis=0)
 
+        def linearised(rows: Rows, c: Array) -> tuple[Array, Array]:
+            """Design and target of the regression at samples, about the parameters c, over h."""
+            y, G, h = features(inputs[rows], c)
+            standardised = (inputs[rows] - centre) / unit
+            design = design_rows(G, standardised) / h[:, :, None]
+            return design, (outputs[rows] - y + G @ c) / h
+
+        def errors(rows: Rows, mean: Array) -> Array:
+            """Errors r of the fitted coefficients at samples."""
+            y, G, h = features(inputs[rows], mean[:p])
+            standardised = (inputs[rows] - centre) / unit
+            design = design_rows(G, standardised) / h[:, :, None]
+            return np.asarray((outputs[rows] - y) / h - design[:, :, p:] @ mean[p:])
+
+        persistence = np.zeros(features.n_outputs)
         for step in [thinning] * (settings.fit_rounds - 1) + [1]:
-            some_inputs = inputs[::step]
-            some_outputs = outputs[::step]
+            rows = np.arange(0, len(inputs), step)
             # Residuals from before a change help to size the noise of a young regime.
             known = np.concatenate([residuals, earlier_residuals])
             noise = known.T @ known / len(known)
             variance = np.diag(noise)
             missing = np.maximum(least_variance - variance, 1e-9 * variance)
             noise = noise + np.diag(missing)
-            y, G, h = features(some_inputs, c)
-            standardised = (some_inputs - centre) / unit
-            design = design_rows(G, standardised) / h[:, :, None]
             # Linearised at the present c: a Gauss-Newton step.
-            target = (some_outputs - y + G @ c) / h
+            design, target = linearised(rows, c)
+            if persistence.any():
+                # What persists of the error before is no news (Cochrane and Orcutt 1949).
+                design_before, target_before = linearised(rows[1:] - 1, c)
+                design = design[1:] - persistence[:, None] * design_before
+                target = target[1:] - persistence * target_before
             mean, covariance = _posterior(design, target, noise, priors)
             largest = settings.largest_parameter_error
             c = mean[:p].clip(-largest, largest)
             # Beyond its largest error a parameter means another plant, not a fit.
             mean[:p] = c
-            y, _, _ = features(some_inputs, c)
-            linear_part = design[:, :, p:] @ mean[p:]
-            residuals = (some_outputs - y) / h - linear_part
+            residuals = errors(rows, mean)
+            before = residuals[:-1] if step == 1 else errors(rows[1:] - 1, mean)
+            persistence = _persistence(
+                residuals[1:], before, earlier_persistence, len(earlier_residuals), settings
+            )
+            if persistence.any():
+                residuals = residuals[1:] - persistence * before
 
         residuals = np.concatenate([residuals - residuals.mean(axis=0), earlier_residuals])
-        return cls(features, centre, unit, mean, covariance, residuals)
+        return cls(features, centre, unit, mean, covariance, residuals, persistence)
 
     def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
         """Predictions at inputs (s, a), (M, n+m).
@@ -340,6 +375,30 @@ class EmpiricalModel:
         return np.cov(self.residuals.T)
 
     @property
+    def error_deviation(self) -> Array:
+        """Standard deviation of r, (K,), which is e's where r does not persist."""
+        deviation: Array = self.residuals.std(axis=0) / np.sqrt(1 - self.persistence**2)
+        return deviation
+
+    def mean_error_covariance(self, count: int) -> Array:
+        """Covariance of the mean of so many consecutive r, (K, K).
+
+        That of independent r over their number, times the integrated autocorrelation up to it,
+        1 + 2 Σ_k (1 − k/count) φᵏ.
+        """
+        # φ is an estimate, and errs most of few residuals: its upper limit counts.
+        deviation = np.sqrt((1 - self.persistence**2) / len(self.residuals))
+        persists = self.persistence > 0
+        upper = np.where(persists, self.persistence + 2 * deviation, 0.0).clip(
+            max=LARGEST_PERSISTENCE
+        )
+        lags = np.arange(1, count)
+        weights = 1 - lags / count
+        correlation = weights @ upper ** lags[:, None] if count > 1 else np.zeros(upper.shape)
+        size = np.sqrt((1 + 2 * correlation) / (1 - upper**2))
+        return np.outer(size, size) * self.noise / count
+
+    @property
     def coefficients(self) -> tuple[Array, Array]:
         """c (p,) and W (K, 1+n+m) for inputs in their own units."""
         p = self.features.n_parameters
@@ -356,7 +415,36 @@ class EmpiricalModel:
             "mean": self.mean,
             "covariance": self.covariance,
             "residuals": self.residuals,
+            "persistence": self.persistence,
         }
+
+
+def _persistence(
+    later: Array,
+    before: Array,
+    earlier: Array,
+    n_earlier: int,
+    settings: EmpiricalModelConfiguration,
+) -> Array:
+    """φ of r₊ = φ r + e by least squares, (K,); zero where it may well be none.
+
+    Args:
+        later: r₊, (M, K).
+        before: r, (M, K).
+        earlier: an earlier estimate of φ, (K,).
+        n_earlier: samples of which it was one.
+        settings: how far from zero φ must be.
+    """
+    later = later - later.mean(axis=0)
+    before = before - before.mean(axis=0)
+    square = (before**2).mean(axis=0)
+    product = (later * before).mean(axis=0)
+    here = product / np.maximum(square, np.finfo(np.float64).tiny)
+    count = len(before) + n_earlier
+    estimate = (len(before) * here + n_earlier * earlier) / count
+    shown = estimate * count**0.5 > settings.persistence_doubt
+    phi: Array = np.where(shown, estimate.clip(max=LARGEST_PERSISTENCE), 0.0)
+    return phi
 
 
 def pointers(*arrays: NDArray[Any]) -> list[ctypes.c_void_p]:

@@ -450,8 +450,7 @@ class BackOffOnModel:
         if len(visited) < settings.recent_samples:
             self._reach[:] = np.inf  # the plant has not settled yet
         # The size of a one-step error, at least a millionth of the state's own unit.
-        residual = model.residuals[:, :n].std(axis=0)
-        deviation = residual * h[:, :n].mean(axis=0)
+        deviation = model.error_deviation[:n] * h[:, :n].mean(axis=0)
         deviation = np.maximum(deviation, 1e-6 * problem.units.state)
         self.unit = np.tile(deviation, 2)
         distance = problem.state_upper - problem.state_lower

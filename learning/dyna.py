@@ -157,7 +157,7 @@ class ModelPlant(PlantInOperation):
             y, _, h = model.features(inputs[None], c)
             pick = rng.integers(len(model.residuals))
             linear = W @ np.append(1.0, inputs)
-            error = model.persistence * error + model.residuals[pick]
+            error = model.persistence @ error + model.residuals[pick]
             outcome = y[0] + linear + h[0] * error
             present = outcome[:-1]
             stage_cost = float(outcome[-1])

@@ -5,7 +5,7 @@ parameters are c times their value larger, and its disturbances c times their ma
 size of the error that disturbances in proportion to their magnitudes would make. c and W are
 estimated from transitions by Bayesian generalised least squares, in Gauss-Newton steps since y is
 not linear in c; the width of the prior of W's slopes is the one of greatest evidence (MacKay 1992).
-Errors persist where disturbances do: r₊ = φ r + e. The residuals e are kept and drawn anew. The
+Errors persist where disturbances do: r₊ = Φ r + e. The residuals e are kept and drawn anew. The
 model knows no parameter of the plant and no law of its disturbances.
 """
 
@@ -29,13 +29,12 @@ from controllers.problem import Problem
 from cosim.core.protocols import Array
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, NonNegative, Positive, Share
+from learning.persistence import error_covariance, estimated, mean_error_covariance
 
 Rows = NDArray[np.intp]
 """Numbers of samples."""
 INTEGRATION_ERROR = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
-LARGEST_PERSISTENCE = 0.99
-"""Largest φ: errors that last for 100 samples; longer ones are the mean's."""
 BLOCK = 250
 """Rows of the fit that are factored at a time: as many as fit in a processor's cache."""
 
@@ -55,16 +54,16 @@ class EmpiricalModelConfiguration(Configuration):
     slope_deviations: tuple[Positive, ...] = Field(
         (0.1, 0.01, 0.001),
         description="prior standard deviations of W's slopes to choose from by evidence, in "
-        "standard deviations of the error over one of the input",
+        "standard deviations of the error over one of the input; where errors persist the least",
     )
     smallest_error_size: Positive = Field(
         0.1,
         description="least h, as a share of its value at the reference",
     )
     persistence_doubt: NonNegative = Field(
-        3.0,
-        description="standard deviations that the errors' lag-one autocorrelation must exceed, or "
-        "errors count as independent in time",
+        4.0,
+        description="standard deviations by which errors must look correlated in time, or they "
+        "count as independent",
     )
     fit_rounds: Count = Field(
         6,
@@ -224,6 +223,35 @@ class Features:
         return y.T, G, h.T
 
 
+class _Regression:
+    """The regression of outputs (M, K) on inputs (M, n+m), linear about parameters c."""
+
+    def __init__(self, features: Features, inputs: Array, outputs: Array) -> None:
+        self._features = features
+        self._inputs = inputs
+        self._outputs = outputs
+        # Standardised inputs: one width of the prior serves all slopes.
+        self.centre: Array = inputs.mean(axis=0)
+        unit = inputs.std(axis=0)
+        self.unit: Array = np.where(unit > 0, unit, 1.0)
+
+    def linearised(self, c: Array, rows: Rows) -> tuple[Array, Array]:
+        """Design (·, K, q) and target (·, K) of some samples about c, over h."""
+        y, G, h = self._features(self._inputs[rows], c)
+        standardised = (self._inputs[rows] - self.centre) / self.unit
+        design = design_rows(G, standardised) / h[:, :, None]
+        return design, (self._outputs[rows] - y + G @ c) / h
+
+    def errors(self, mean: Array, rows: Rows) -> Array:
+        """Errors r (·, K) of some samples with the coefficients `mean`."""
+        p = self._features.n_parameters
+        y, G, h = self._features(self._inputs[rows], mean[:p])
+        standardised = (self._inputs[rows] - self.centre) / self.unit
+        design = design_rows(G, standardised) / h[:, :, None]
+        errors: Array = (self._outputs[rows] - y) / h - design[:, :, p:] @ mean[p:]
+        return errors
+
+
 @dataclass(frozen=True)
 class EmpiricalModel:
     """The estimate from M transitions.
@@ -234,7 +262,7 @@ class EmpiricalModel:
         mean: c, then W row by row for the inputs (1, s, a), standardised, (p + K(1+n+m),).
         covariance: that of the posterior of `mean`.
         residuals: e, (M, K), of mean zero; r itself where it does not persist.
-        persistence: φ, the share of r that the next sample keeps, (K,).
+        persistence: Φ, what the next sample keeps of r, (K, K); zero where errors are independent.
     """
 
     features: Features
@@ -261,19 +289,17 @@ class EmpiricalModel:
             inputs: (s, a), (M, n+m).
             outputs: (s₊, ℓ), (M, K).
             settings: prior and rounds.
-            earlier: an earlier estimate, whose residuals are kept beside the new ones, and whose φ
+            earlier: an earlier estimate, whose residuals are kept beside the new ones, and whose Φ
                 counts as if they had been seen here.
         """
         p = features.n_parameters
-        earlier_residuals = np.empty((0, features.n_outputs))
-        earlier_persistence = np.zeros(features.n_outputs)
+        K = features.n_outputs
+        earlier_residuals = np.empty((0, K))
+        earlier_persistence = np.zeros((K, K))
         if earlier is not None:
             earlier_residuals = earlier.residuals
             earlier_persistence = earlier.persistence
-        # Standardised inputs: one width of the prior serves all slopes.
-        centre = inputs.mean(axis=0)
-        unit = inputs.std(axis=0)
-        unit = np.where(unit > 0, unit, 1.0)
+        regression = _Regression(features, inputs, outputs)
 
         # All fits but the last take every `thinning`-th sample.
         thinning = max(len(inputs) // settings.fit_samples, 1)
@@ -282,54 +308,55 @@ class EmpiricalModel:
         nominal_errors = outputs[::thinning] - y
         # The sizes of the nominal model's errors set the widths of W.
         priors = _priors(nominal_errors, y, features, settings)
-        residuals = nominal_errors / h
-        residuals = residuals - residuals.mean(axis=0)
         least_variance = INTEGRATION_ERROR**2 * ((y / h) ** 2).mean(axis=0)
 
-        def linearised(rows: Rows, c: Array) -> tuple[Array, Array]:
-            """Design and target of the regression at samples, about the parameters c, over h."""
-            y, G, h = features(inputs[rows], c)
-            standardised = (inputs[rows] - centre) / unit
-            design = design_rows(G, standardised) / h[:, :, None]
-            return design, (outputs[rows] - y + G @ c) / h
+        def split(mean: Array, step: int) -> tuple[Array, Array]:
+            """Errors of every so many samples, as residuals and Φ."""
+            errors = regression.errors(mean, np.arange(0, len(inputs), step))
+            before = errors[:-1]
+            if step > 1:
+                before = regression.errors(mean, np.arange(step, len(inputs), step) - 1)
+            persistence = estimated(
+                errors[1:],
+                before,
+                settings.persistence_doubt,
+                earlier_persistence,
+                len(earlier_residuals),
+            )
+            if persistence.any():
+                errors = errors[1:] - before @ persistence.T
+            return errors - errors.mean(axis=0), persistence
 
-        def errors(rows: Rows, mean: Array) -> Array:
-            """Errors r of the fitted coefficients at samples."""
-            y, G, h = features(inputs[rows], mean[:p])
-            standardised = (inputs[rows] - centre) / unit
-            design = design_rows(G, standardised) / h[:, :, None]
-            return np.asarray((outputs[rows] - y) / h - design[:, :, p:] @ mean[p:])
-
-        persistence = np.zeros(features.n_outputs)
+        # Φ begins at that of the nominal errors: W, fitted to states that persistent errors have
+        # moved, would take these for its own, and leave none that persist.
+        residuals, persistence = split(np.zeros(priors[0].size), thinning)
         for step in [thinning] * (settings.fit_rounds - 1) + [1]:
-            rows = np.arange(0, len(inputs), step)
             # Residuals from before a change help to size the noise of a young regime.
             known = np.concatenate([residuals, earlier_residuals])
             noise = known.T @ known / len(known)
             variance = np.diag(noise)
             missing = np.maximum(least_variance - variance, 1e-9 * variance)
             noise = noise + np.diag(missing)
+            # In closed loop a slope cannot be told from what persists: states and actions follow it.
+            widths = priors[-1:] if persistence.any() else priors
             # Linearised at the present c: a Gauss-Newton step.
-            design, target = linearised(rows, c)
+            rows = np.arange(0, len(inputs), step)
+            design, target = regression.linearised(c, rows)
             if persistence.any():
                 # What persists of the error before is no news (Cochrane and Orcutt 1949).
-                design_before, target_before = linearised(rows[1:] - 1, c)
-                design = design[1:] - persistence[:, None] * design_before
-                target = target[1:] - persistence * target_before
-            mean, covariance = _posterior(design, target, noise, priors)
+                design_before, target_before = regression.linearised(c, rows[1:] - 1)
+                design = design[1:] - persistence @ design_before
+                target = target[1:] - target_before @ persistence.T
+            mean, covariance = _posterior(design, target, noise, widths)
             largest = settings.largest_parameter_error
             c = mean[:p].clip(-largest, largest)
             # Beyond its largest error a parameter means another plant, not a fit.
             mean[:p] = c
-            residuals = errors(rows, mean)
-            before = residuals[:-1] if step == 1 else errors(rows[1:] - 1, mean)
-            persistence = _persistence(
-                residuals[1:], before, earlier_persistence, len(earlier_residuals), settings
-            )
-            if persistence.any():
-                residuals = residuals[1:] - persistence * before
+            residuals, persistence = split(mean, step)
 
-        residuals = np.concatenate([residuals - residuals.mean(axis=0), earlier_residuals])
+        residuals = np.concatenate([residuals, earlier_residuals])
+        centre = regression.centre
+        unit = regression.unit
         return cls(features, centre, unit, mean, covariance, residuals, persistence)
 
     def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
@@ -377,26 +404,14 @@ class EmpiricalModel:
     @property
     def error_deviation(self) -> Array:
         """Standard deviation of r, (K,), which is e's where r does not persist."""
-        deviation: Array = self.residuals.std(axis=0) / np.sqrt(1 - self.persistence**2)
-        return deviation
+        if not self.persistence.any():
+            return np.asarray(self.residuals.std(axis=0))
+        covariance = error_covariance(self.persistence, self.noise)
+        return np.asarray(np.sqrt(np.diag(covariance)))
 
     def mean_error_covariance(self, count: int) -> Array:
-        """Covariance of the mean of so many consecutive r, (K, K).
-
-        That of independent r over their number, times the integrated autocorrelation up to it,
-        1 + 2 Σ_k (1 − k/count) φᵏ.
-        """
-        # φ is an estimate, and errs most of few residuals: its upper limit counts.
-        deviation = np.sqrt((1 - self.persistence**2) / len(self.residuals))
-        persists = self.persistence > 0
-        upper = np.where(persists, self.persistence + 2 * deviation, 0.0).clip(
-            max=LARGEST_PERSISTENCE
-        )
-        lags = np.arange(1, count)
-        weights = 1 - lags / count
-        correlation = weights @ upper ** lags[:, None] if count > 1 else np.zeros(upper.shape)
-        size = np.sqrt((1 + 2 * correlation) / (1 - upper**2))
-        return np.outer(size, size) * self.noise / count
+        """Covariance of the mean of so many consecutive r, (K, K)."""
+        return mean_error_covariance(self.persistence, self.noise, count, len(self.residuals))
 
     @property
     def coefficients(self) -> tuple[Array, Array]:
@@ -417,34 +432,6 @@ class EmpiricalModel:
             "residuals": self.residuals,
             "persistence": self.persistence,
         }
-
-
-def _persistence(
-    later: Array,
-    before: Array,
-    earlier: Array,
-    n_earlier: int,
-    settings: EmpiricalModelConfiguration,
-) -> Array:
-    """φ of r₊ = φ r + e by least squares, (K,); zero where it may well be none.
-
-    Args:
-        later: r₊, (M, K).
-        before: r, (M, K).
-        earlier: an earlier estimate of φ, (K,).
-        n_earlier: samples of which it was one.
-        settings: how far from zero φ must be.
-    """
-    later = later - later.mean(axis=0)
-    before = before - before.mean(axis=0)
-    square = (before**2).mean(axis=0)
-    product = (later * before).mean(axis=0)
-    here = product / np.maximum(square, np.finfo(np.float64).tiny)
-    count = len(before) + n_earlier
-    estimate = (len(before) * here + n_earlier * earlier) / count
-    shown = estimate * count**0.5 > settings.persistence_doubt
-    phi: Array = np.where(shown, estimate.clip(max=LARGEST_PERSISTENCE), 0.0)
-    return phi
 
 
 def pointers(*arrays: NDArray[Any]) -> list[ctypes.c_void_p]:
@@ -489,7 +476,7 @@ def _priors(
     deviation = errors.std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
     parameters = np.full(features.n_parameters, settings.parameter_deviation)
     priors = []
-    for slope in settings.slope_deviations:
+    for slope in sorted(settings.slope_deviations, reverse=True):
         row = [1.0] + [slope] * features.n_inputs
         priors.append(np.append(parameters, np.outer(deviation, row)))
     return priors

@@ -133,7 +133,7 @@ class PlantData:
             predicted, h, _ = model.predict(inputs[-n_latest:])
             errors = (outputs[-n_latest:] - predicted) / h
             if models[1].persistence.any():
-                errors = errors[1:] - models[1].persistence * errors[:-1]
+                errors = errors[1:] - errors[:-1] @ models[1].persistence.T
             squares = float(np.einsum("mi,ij,mj->", errors, precision, errors))
             losses.append(squares / 2)
         evidence = losses[0] - losses[1]
@@ -161,7 +161,7 @@ class PlantData:
                 predicted_before, h_before, _ = self.model.predict(inputs[before])
                 error_before = (outputs[before] - predicted_before) / h_before
                 errors_before = np.concatenate([error_before, errors[:-1]])
-                predicted = predicted + h * self.model.persistence * errors_before
+                predicted = predicted + h * (errors_before @ self.model.persistence.T)
             self._blocks.append(Predictions(predicted, h, errors, designs))
         latest = self._blocks[-windows[-1] // block :]
         columns = [np.concatenate(column) for column in zip(*latest, strict=True)]

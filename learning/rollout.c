@@ -35,11 +35,12 @@ static int empirical_step(void *plant, long long sample, int *status) {
         for (int j = 0; j < N_W; j++) predicted[i] += row[1 + j] * model->inputs[j];
     }
     const double *const residual = model->residuals + (int64_t)model->picks[sample] * K;
+    double persists[K] = {0.0};
     for (int i = 0; i < K; i++) {
-        const double persists = model->persistence[i] * model->error[i];
-        predicted[i] += h[i] * persists;
-        model->error[i] = persists + residual[i];
+        for (int j = 0; j < K; j++) persists[i] += model->persistence[i * K + j] * model->error[j];
+        predicted[i] += h[i] * persists[i];
     }
+    for (int i = 0; i < K; i++) model->error[i] = persists[i] + residual[i];
     for (int i = 0; i < N_X; i++) model->inputs[i] = predicted[i] + h[i] * residual[i];
     return OK;
 }

@@ -185,7 +185,7 @@ class ModelledPlant:
         y, h = self._model.features.mean(self._s, a, self._c)
         self.inputs[number] = inputs
         self.h[number] = h.full()[:, 0]
-        persists = self._model.persistence * self._error
+        persists = self._model.persistence @ self._error
         predicted = y.full()[:, 0] + self._W @ np.append(1.0, inputs)
         self.predicted[number] = predicted + self.h[number] * persists
         residual = self._model.residuals[self._picks[number]]

@@ -29,7 +29,12 @@ from controllers.problem import Problem
 from cosim.core.protocols import Array
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, NonNegative, Positive, Share
-from learning.persistence import error_covariance, estimated, mean_error_covariance
+from learning.persistence import (
+    effective_number,
+    error_covariance,
+    estimated,
+    mean_error_covariance,
+)
 
 Rows = NDArray[np.intp]
 """Numbers of samples."""
@@ -337,7 +342,7 @@ class EmpiricalModel:
             variance = np.diag(noise)
             missing = np.maximum(least_variance - variance, 1e-9 * variance)
             noise = noise + np.diag(missing)
-            # In closed loop a slope cannot be told from what persists: states and actions follow it.
+            # In closed loop no slope can be told from what persists: states and actions follow.
             widths = priors[-1:] if persistence.any() else priors
             # Linearised at the present c: a Gauss-Newton step.
             rows = np.arange(0, len(inputs), step)
@@ -402,16 +407,24 @@ class EmpiricalModel:
         return np.cov(self.residuals.T)
 
     @property
+    def error_covariance(self) -> Array:
+        """Covariance of r, (K, K), which is e's where r does not persist."""
+        return error_covariance(self.persistence, self.noise)
+
+    @property
     def error_deviation(self) -> Array:
-        """Standard deviation of r, (K,), which is e's where r does not persist."""
-        if not self.persistence.any():
-            return np.asarray(self.residuals.std(axis=0))
-        covariance = error_covariance(self.persistence, self.noise)
-        return np.asarray(np.sqrt(np.diag(covariance)))
+        """Standard deviation of r, (K,)."""
+        growth = np.diag(self.error_covariance) / np.diag(self.noise)
+        deviation: Array = self.residuals.std(axis=0) * np.sqrt(growth)
+        return deviation
 
     def mean_error_covariance(self, count: int) -> Array:
         """Covariance of the mean of so many consecutive r, (K, K)."""
-        return mean_error_covariance(self.persistence, self.noise, count, len(self.residuals))
+        return mean_error_covariance(self.persistence, self.noise, count)
+
+    def effective_number(self, count: int) -> float:
+        """Number of independent errors that would say as much as so many consecutive r."""
+        return effective_number(self.persistence, count)
 
     @property
     def coefficients(self) -> tuple[Array, Array]:

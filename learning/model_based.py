@@ -222,8 +222,11 @@ class ModelBased(Algorithm):
         model = data.fit()
         inputs, _ = data.present
         if data.regime_start != self._regime_start:
+            # A regime that was young itself had a floor of before.
+            young = data.regime_start - self._regime_start < settings.steady_samples
+            floored = young and self._regime_start > 0
+            self._floor = np.minimum(self._floor, self.back_off) if floored else self.back_off
             self._regime_start = data.regime_start
-            self._floor = self.back_off
         # Day by day an optimum moves little: then the search begins at the present back-offs.
         # Without limits the present cost was never predicted.
         known = bool(np.isfinite(self._limits).all())

@@ -126,16 +126,15 @@ class PlantData:
             models.append(
                 EmpiricalModel.fit(self.features, inputs[part], outputs[part], self.settings)
             )
-        # Both are judged by the noise of the newer model.
-        precision = np.linalg.pinv(models[1].noise)
+        # Both are judged by the noise of the newer model, and by as many errors as are independent.
+        precision = np.linalg.pinv(models[1].error_covariance)
+        share = models[1].effective_number(n_latest) / n_latest
         losses = []
         for model in models:
             predicted, h, _ = model.predict(inputs[-n_latest:])
             errors = (outputs[-n_latest:] - predicted) / h
-            if models[1].persistence.any():
-                errors = errors[1:] - errors[:-1] @ models[1].persistence.T
             squares = float(np.einsum("mi,ij,mj->", errors, precision, errors))
-            losses.append(squares / 2)
+            losses.append(share * squares / 2)
         evidence = losses[0] - losses[1]
         return n_older if evidence > self.settings.forecast_evidence else 0
 
@@ -178,7 +177,11 @@ class PlantData:
         """
         model = self.model
         assert model is not None
-        M, K = model.residuals.shape
+        K = self.features.n_outputs
+        M = model.effective_number(len(model.residuals))
+        # So few independent errors say nothing of their own size.
+        if M <= K + 1:
+            return False
         for window in self.settings.change_windows:
             if window > len(predictions.errors):
                 break

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from math import inf
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
 from learning.errors import PrivilegeError
 from learning.exploration import Strategy
+from learning.retreat import Retreat
+from learning.step import update_without_fit
 
 FLAGS_EVERY = 10
 """Samples between two checks of a solution's flags, which cost as much as a feedback."""
@@ -75,6 +77,7 @@ class TrainingLoop:
         rng: draws the exploration.
         rest_after: samples after which θ stays and nothing explores; None: never.
         algorithm_rng: the rule's own generator, which checkpoints keep.
+        retreat: says when θ goes back to a better one; None: never.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class TrainingLoop:
         rng: np.random.Generator,
         rest_after: int | None = None,
         algorithm_rng: np.random.Generator | None = None,
+        retreat: Retreat | None = None,
     ) -> None:
         scenario = plant.scenario
         # A rule in operation cannot reach the plant, not even by an attribute.
@@ -100,6 +104,7 @@ class TrainingLoop:
         self.rng = rng
         self._algorithm_rng = algorithm_rng
         self._strategy = strategy
+        self._retreat = retreat
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
         self._penalty = scenario.state_penalty
@@ -143,10 +148,15 @@ class TrainingLoop:
         if has_ended:
             return cost, None
         update: Update | None = None
-        if transition is not None:
+        if self._waits:
+            # θ stays after a retreat; what happens then may still be remembered.
+            if transition is not None and hasattr(self.algorithm, "watch"):
+                self.algorithm.watch(transition)
+        elif transition is not None:
             update = self.algorithm.observe(transition)
         elif hasattr(self.algorithm, "failed"):
             update = self.algorithm.failed(cost)
+        update = self._compared(cost) or update
         if update is None:
             return cost, None
         self.counts.failures += update.failures
@@ -156,6 +166,26 @@ class TrainingLoop:
         else:
             self.renew()
         return cost, update
+
+    @property
+    def _waits(self) -> bool:
+        """Whether θ stays as it is, after a retreat."""
+        return self._retreat is not None and self._retreat.samples_to_wait > 0
+
+    def _compared(self, cost: float) -> Update | None:
+        """Compare the cost of the shift that a sample may end; the update of a retreat."""
+        if self._retreat is None:
+            return None
+        theta = self.controller.theta
+        predicted = getattr(self.algorithm, "predicted_cost", nan)
+        back = self._retreat.observe(cost, theta, predicted)
+        if back is None:
+            return None
+        self.controller.theta = back
+        if hasattr(self.algorithm, "retreat"):
+            self.algorithm.retreat()
+        blocks = self.controller.parameters.blocks
+        return update_without_fit(blocks, theta, back)._replace(retreated=True)
 
     def renew(self) -> None:
         """Solve again for the present state at the same linearisation point, after θ has moved."""
@@ -263,6 +293,8 @@ class TrainingLoop:
         if self._loop.point is not None:
             state |= prefixed("point", self._loop.point._asdict())
         state |= prefixed("counts", asdict(self.counts))
+        if self._retreat is not None:
+            state |= prefixed("retreat", self._retreat.state_dict())
         state |= prefixed("algorithm", self.algorithm.state_dict())
         return state
 
@@ -274,6 +306,8 @@ class TrainingLoop:
         point = part_of(state, "point")
         self._loop.point = LinearisationPoint(**point) if point else None
         self.counts = Counts(**part_of(state, "counts"))
+        if self._retreat is not None:
+            self._retreat.load_state_dict(part_of(state, "retreat"))
         self.algorithm.load_state_dict(part_of(state, "algorithm"))
         # Only now: a rule may draw while it restores itself.
         set_generator_state(self.rng, state["rng"])

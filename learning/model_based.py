@@ -169,15 +169,16 @@ class ModelBased(Algorithm):
         self._rollout = Rollout(self._problem, start, self._features)
         self._data = PlantData(self._features, settings)
         # A start that is backed off already is not given away.
-        lower = start["x_l"] - self._base["x_l"]
-        upper = self._base["x_u"] - start["x_u"]
-        self.back_off: Array = np.maximum(np.concatenate([lower, upper]), 0.0)
+        self._start = start
+        self.back_off: Array = self._back_offs(start)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
         self._due = settings.first_update  # samples at the next update
         self._regime_start = 0  # of the latest update
         self._floor = np.zeros_like(self.back_off)  # back-offs when that regime began
         # Of the mean cost, for each window of the change detection.
         self._limits: Array = np.full(len(settings.change_windows), np.inf)
+        self.predicted_cost = float("nan")
+        """What the model predicts of θ, mean cost per sample; NaN before the first update."""
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
 
@@ -198,6 +199,24 @@ class ModelBased(Algorithm):
         if alarmed or data.count >= self._due:
             return self._update(alarmed)
         return None
+
+    def watch(self, transition: Transition) -> None:
+        """Keep a transition; θ stays."""
+        self._data.add(transition)
+
+    def retreat(self) -> None:
+        """Take the back-offs of the θ to which the loop has gone back; nothing is predicted."""
+        self.back_off = self._back_offs(self.controller.parameters)
+        self._floor = np.zeros_like(self.back_off)
+        self._limits[:] = np.inf
+        self.predicted_cost = np.nan
+
+    def _back_offs(self, theta: Parameters) -> Array:
+        """Back-offs of θ from the true bounds, lower then upper ones, (2n,)."""
+        lower = theta["x_l"] - self._base["x_l"]
+        upper = self._base["x_u"] - theta["x_u"]
+        back_offs: Array = np.maximum(np.concatenate([lower, upper]), 0.0)
+        return back_offs
 
     def alarmed(self, model: EmpiricalModel) -> bool:
         """Whether samples cost more than was predicted or, on new data, the plant is another."""
@@ -255,12 +274,16 @@ class ModelBased(Algorithm):
         cost_of_new, cost_of_present = search.predicted_costs([new, present.theta])
         better = search.excess(cost_of_new, cost_of_present) <= 0
         self._limits = (cost_of_new if better else cost_of_present).limits
-        if not np.isfinite(self._limits).all():
-            # Nothing is known of the present cost: look again soon.
-            self._due = min(self._due, data.count + settings.change_windows[-2])
+        self.predicted_cost = (cost_of_new if better else cost_of_present).cost
         if better:
             self.back_off = best
             self.controller.theta = new
+        elif not np.isfinite(self._limits).all():
+            # Nothing is known of any cost: the start is what an engineer would have chosen. Look
+            # again soon.
+            self.back_off = self._back_offs(self._start)
+            self.controller.theta = self._start.theta
+            self._due = min(self._due, data.count + settings.change_windows[-2])
         self.model_samples += search.n_samples
         end = self.controller.theta
         return update_without_fit(present.blocks, present.theta, end, refused=not better)
@@ -337,6 +360,7 @@ class ModelBased(Algorithm):
             "due": self._due,
             "model_samples": self.model_samples,
             "limits": self._limits,
+            "predicted_cost": self.predicted_cost,
             "floor": self._floor,
             "regime_start": self._regime_start,
             **prefixed("data", self._data.state_dict()),
@@ -348,6 +372,7 @@ class ModelBased(Algorithm):
         self._due = state["due"]
         self.model_samples = state["model_samples"]
         self._limits = state["limits"]
+        self.predicted_cost = state["predicted_cost"]
         self._floor = state["floor"]
         self._regime_start = state["regime_start"]
         self._data.load_state_dict(part_of(state, "data"))

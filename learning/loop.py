@@ -156,6 +156,8 @@ class TrainingLoop:
             update = self.algorithm.observe(transition)
         elif hasattr(self.algorithm, "failed"):
             update = self.algorithm.failed(cost)
+        if update is not None and update.lost and self._retreat is not None:
+            self._go_back(self._retreat.best_theta)
         update = self._compared(cost) or update
         if update is None:
             return cost, None
@@ -181,11 +183,17 @@ class TrainingLoop:
         back = self._retreat.observe(cost, theta, predicted)
         if back is None:
             return None
-        self.controller.theta = back
-        if hasattr(self.algorithm, "retreat"):
-            self.algorithm.retreat()
+        self._go_back(back)
         blocks = self.controller.parameters.blocks
         return update_without_fit(blocks, theta, back)._replace(retreated=True)
+
+    def _go_back(self, theta: Vector) -> None:
+        """Set θ back and tell the rule."""
+        if np.array_equal(theta, self.controller.theta):
+            return
+        self.controller.theta = theta
+        if hasattr(self.algorithm, "retreat"):
+            self.algorithm.retreat()
 
     def renew(self) -> None:
         """Solve again for the present state at the same linearisation point, after θ has moved."""

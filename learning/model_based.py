@@ -169,7 +169,6 @@ class ModelBased(Algorithm):
         self._rollout = Rollout(self._problem, start, self._features)
         self._data = PlantData(self._features, settings)
         # A start that is backed off already is not given away.
-        self._start = start
         self.back_off: Array = self._back_offs(start)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
         self._due = settings.first_update  # samples at the next update
@@ -278,15 +277,14 @@ class ModelBased(Algorithm):
         if better:
             self.back_off = best
             self.controller.theta = new
-        elif not np.isfinite(self._limits).all():
-            # Nothing is known of any cost: the start is what an engineer would have chosen. Look
-            # again soon.
-            self.back_off = self._back_offs(self._start)
-            self.controller.theta = self._start.theta
+        lost = not np.isfinite(self._limits).all()
+        if lost:
+            # Nothing is known of any cost: look again soon.
             self._due = min(self._due, data.count + settings.change_windows[-2])
         self.model_samples += search.n_samples
         end = self.controller.theta
-        return update_without_fit(present.blocks, present.theta, end, refused=not better)
+        update = update_without_fit(present.blocks, present.theta, end, refused=not better)
+        return update._replace(lost=lost)
 
     def least_back_offs(self, present: Array, inputs: Array) -> Array:
         """Least back-offs that the data allow.
@@ -525,8 +523,11 @@ class BackOffOnModel:
         if not complete or not np.isfinite(predicted).all():
             return lost
         # A rollout counts once it has settled.
-        costs, penalties = self._costs(predicted, h)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
+            costs, penalties = self._costs(predicted, h)
         cost = float(costs.mean())
+        if not np.isfinite(cost):
+            return lost
         stage_cost = float(predicted[:, -1].mean())
         size = max(abs(stage_cost), np.finfo(np.float64).eps)
         # A bound shows in lost rollouts too.

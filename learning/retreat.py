@@ -112,6 +112,11 @@ class Retreat:
         """Samples of a shift."""
         return self._batch * BATCHES
 
+    @property
+    def best_theta(self) -> Vector:
+        """θ that has been shown to cost least, (n_θ,); the start where none has been."""
+        return self._start if self._best is None else self._best.theta
+
     def observe(
         self,
         cost: float,

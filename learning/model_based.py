@@ -237,7 +237,13 @@ class ModelBased(Algorithm):
         """Fit the model, search on it, and move θ where the model predicts less for the new one."""
         settings = self.configuration
         data = self._data
-        model = data.fit()
+        present = self.controller.parameters
+        model = self._fitted()
+        if model is None:
+            # A plant that has run away leaves no model: ask again soon.
+            self._due = data.count + settings.change_windows[-2]
+            stays = update_without_fit(present.blocks, present.theta, present.theta, refused=True)
+            return stays._replace(lost=True)
         inputs, _ = data.present
         if data.regime_start != self._regime_start:
             # A regime that was young itself had a floor of before.
@@ -254,7 +260,6 @@ class ModelBased(Algorithm):
         # Data double between updates, then grow by a share.
         self._due = data.count + max(interval, settings.first_update)
 
-        present = self.controller.parameters
         latest, _ = data.latest(settings.recent_samples)
         base, gained = self.corrected(present, model, inputs[-settings.recent_samples :])
         # What c_f and the parameters correct, back-offs need not hold any more.
@@ -285,6 +290,20 @@ class ModelBased(Algorithm):
         end = self.controller.theta
         update = update_without_fit(present.blocks, present.theta, end, refused=not better)
         return update._replace(lost=lost)
+
+    def _fitted(self) -> EmpiricalModel | None:
+        """The model of the present plant; None where its data or predictions are not finite."""
+        latest, outputs = self._data.latest(self.configuration.recent_samples)
+        if not np.isfinite(outputs).all():
+            return None
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                model = self._data.fit()
+                predicted, h, _ = model.predict(latest)
+        except np.linalg.LinAlgError:
+            return None
+        finite = np.isfinite(predicted).all() and np.isfinite(h).all()
+        return model if finite and np.isfinite(model.noise).all() else None
 
     def least_back_offs(self, present: Array, inputs: Array) -> Array:
         """Least back-offs that the data allow.

@@ -149,13 +149,13 @@ class PlantData:
         block = windows[0]
         # Blocks that are known need not be predicted again.
         new = self.since_fit - block * len(self._blocks)
-        # One more, whose error persists in part.
+        # One more, if there is one: its error persists in part.
         inputs, outputs = self.latest(new + 1)
-        for first in range(1, len(inputs) - block + 1, block):
+        for first in range(len(inputs) - new, len(inputs) - block + 1, block):
             part = slice(first, first + block)
             predicted, h, designs = self.model.predict(inputs[part])
             errors = (outputs[part] - predicted) / h
-            if self.model.persistence.any():
+            if first > 0 and self.model.persistence.any():
                 before = slice(first - 1, first)
                 predicted_before, h_before, _ = self.model.predict(inputs[before])
                 error_before = (outputs[before] - predicted_before) / h_before

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
+from scipy.special import ndtr, stdtrit
 
 from controllers.economic import tune
 from controllers.errors import TuningError
@@ -131,6 +132,11 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
         1.0,
         description="standard deviations of a difference of costs within which the model cannot "
         "tell",
+    )
+    persistent_doubt: NonNegative = Field(
+        3.0,
+        description="the same where errors persist, of which the model knows the first order "
+        "alone; θ then moves only where its cost is below the present one by as much",
     )
     plateau: Positive = Field(
         2e-5,
@@ -276,7 +282,8 @@ class ModelBased(Algorithm):
         new = search.theta(best)
         search.draw(settings.fine_rollout)
         cost_of_new, cost_of_present = search.predicted_costs([new, present.theta])
-        better = search.excess(cost_of_new, cost_of_present) <= 0
+        least_gain = search.doubt if model.persistence.any() else 0.0
+        better = search.excess(cost_of_new, cost_of_present) <= -least_gain
         self._limits = (cost_of_new if better else cost_of_present).limits
         self.predicted_cost = (cost_of_new if better else cost_of_present).cost
         if better:
@@ -465,6 +472,7 @@ class BackOffOnModel:
     Attributes:
         n_samples: of rollouts so far.
         unit: of the back-offs, the standard deviation of the one-step error, (2n,).
+        doubt: deviations of a difference of costs within which the model cannot tell.
     """
 
     def __init__(
@@ -500,6 +508,12 @@ class BackOffOnModel:
         self.unit = np.tile(deviation, 2)
         distance = problem.state_upper - problem.state_lower
         self._most = np.tile(settings.largest_back_off * distance, 2)
+        self.doubt = settings.doubt
+        if model.persistence.any():
+            # Student's: few independent errors hardly know their own size.
+            n_independent = model.effective_number(len(model.residuals))
+            tail = ndtr(settings.persistent_doubt)
+            self.doubt = float(stdtrit(n_independent, tail))
         self._penalty_share = np.zeros(2 * n)  # largest of each bound so far
         self.n_samples = 0
         self.draw(settings.coarse_rollout)
@@ -669,7 +683,7 @@ class BackOffOnModel:
         costs = self.predicted_costs([self.theta(point) for point in points])
         free = delta
         for point, cost in zip(points, costs, strict=True):
-            if self.excess(cost, costs[0]) <= self._settings.doubt:
+            if self.excess(cost, costs[0]) <= self.doubt:
                 free = point
         return free
 
@@ -690,7 +704,7 @@ class BackOffOnModel:
         # Of what the model cannot tell apart, the smallest back-off.
         close = []
         for point, cost in zip(points, costs, strict=True):
-            if self.excess(cost, least) <= self._settings.doubt:
+            if self.excess(cost, least) <= self.doubt:
                 close.append(point)
 
         def size(point: Array) -> float:

@@ -67,6 +67,9 @@ class Update(NamedTuple):
         corrected: the step was changed to keep them definite.
         refused: the step was not taken, or the best back-off was the last one tried.
         failures: the algorithm's own QPs that failed.
+        lost: the rule knows nothing of what any θ costs; the loop sets the best one shown, the
+            start at first.
+        retreated: θ went back to one that has been shown to cost less (`learning.retreat`).
         episode: seed of the plant's noise with which to reset the plant to the scenario's initial
             state, for algorithms that require a simulator; PrivilegeError otherwise.
     """
@@ -78,6 +81,8 @@ class Update(NamedTuple):
     refused: bool = False
     failures: int = 0
     episode: int | None = None
+    lost: bool = False
+    retreated: bool = False
 
 
 class Algorithm:
@@ -100,10 +105,14 @@ class Algorithm:
     Optional, looked up by name:
 
     - `theta` (n_θ,), a property: the final θ so far, where the controller carries another one.
-      Log, evaluation, divergence, parameters.toml and summary are of it.
+      Log, evaluation, divergence, parameters.toml and summary are of it. Such a rule tries θ on
+      purpose, so it never retreats.
     - `budget`, int, of the class: samples of a run where the user says nothing, else 50 000.
     - `first_episode`, int (simulator only): seed of the plant's noise at the start.
     - `explores`, bool: whether the samples explore now; they do where it is not there.
+    - `retreat()`: called where the loop has set θ back; the rule goes on from that.
+    - `watch(transition)`: called in place of `observe` while θ stays after a retreat.
+    - `predicted_cost`, float: what θ is expected to cost on average, if that is known.
     - `failed(cost) -> Update | None`: called in place of `observe` on a sample at which the
       controller failed, with the sample's share of J.
 

@@ -175,6 +175,10 @@ class BatchQLearning(ValueRule):
         self._start = start.theta.copy()
         return td_error
 
+    def retreat(self) -> None:
+        """Take the θ to which the loop has gone back for the mean of the prior."""
+        self._mean = self._present
+
     def state_dict(self) -> State:
         """What `ValueRule` keeps, the open batch, and the posterior."""
         return {

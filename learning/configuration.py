@@ -70,6 +70,12 @@ class Configuration(BaseModel):
         1e-3,
         description="least eigenvalue that B_l and B_Vf may have, in the problem's own units",
     )
+    retreat_probability: Share = Field(
+        3e-4,
+        description="probability by which a shift's cost is above the least one shown, though both "
+        "are the same, below which θ goes back to that; 0: it never does",
+    )
+    shift_hours: Positive = Field(8.0, description="hours of a shift")
     exploration: Literal["additive", "literal", "none"] = Field(
         "additive",
         description="a = sat(π+e), a = sat(e), or always a = π; a scenario's table [exploration] "

@@ -149,16 +149,18 @@ class ModelPlant(PlantInOperation):
         self.scenario = scenario
         c, W = model.coefficients
         present = s
+        error = np.zeros(model.features.n_outputs)
 
         def step(a: Array) -> Step:
-            nonlocal present
+            nonlocal present, error
             penalty = scenario.state_penalty(present.tolist())
             # Residuals as they came, so that no law of the noise is assumed.
             inputs = np.concatenate([present, a])
             y, _, h = model.features(inputs[None], c)
             pick = rng.integers(len(model.residuals))
             linear = W @ np.append(1.0, inputs)
-            outcome = y[0] + linear + h[0] * model.residuals[pick]
+            error = model.persistence @ error + model.residuals[pick]
+            outcome = y[0] + linear + h[0] * error
             present = outcome[:-1]
             stage_cost = float(outcome[-1])
             return Step(present, stage_cost, penalty, np.zeros(0))

@@ -5,8 +5,8 @@ parameters are c times their value larger, and its disturbances c times their ma
 size of the error that disturbances in proportion to their magnitudes would make. c and W are
 estimated from transitions by Bayesian generalised least squares, in Gauss-Newton steps since y is
 not linear in c; the width of the prior of W's slopes is the one of greatest evidence (MacKay 1992).
-The residuals r are kept and drawn anew. The model knows no parameter of the plant and no law of its
-disturbances.
+Errors persist where disturbances do: r₊ = Φ r + e. The residuals e are kept and drawn anew. The
+model knows no parameter of the plant and no law of its disturbances.
 """
 
 from __future__ import annotations
@@ -29,7 +29,15 @@ from controllers.problem import Problem
 from cosim.core.protocols import Array
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, NonNegative, Positive, Share
+from learning.persistence import (
+    effective_number,
+    error_covariance,
+    estimated,
+    mean_error_covariance,
+)
 
+Rows = NDArray[np.intp]
+"""Numbers of samples."""
 INTEGRATION_ERROR = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
 BLOCK = 250
@@ -51,11 +59,16 @@ class EmpiricalModelConfiguration(Configuration):
     slope_deviations: tuple[Positive, ...] = Field(
         (0.1, 0.01, 0.001),
         description="prior standard deviations of W's slopes to choose from by evidence, in "
-        "standard deviations of the error over one of the input",
+        "standard deviations of the error over one of the input; where errors persist the least",
     )
     smallest_error_size: Positive = Field(
         0.1,
         description="least h, as a share of its value at the reference",
+    )
+    persistence_doubt: NonNegative = Field(
+        4.0,
+        description="standard deviations by which errors must look correlated in time, or they "
+        "count as independent",
     )
     fit_rounds: Count = Field(
         6,
@@ -215,6 +228,35 @@ class Features:
         return y.T, G, h.T
 
 
+class _Regression:
+    """The regression of outputs (M, K) on inputs (M, n+m), linear about parameters c."""
+
+    def __init__(self, features: Features, inputs: Array, outputs: Array) -> None:
+        self._features = features
+        self._inputs = inputs
+        self._outputs = outputs
+        # Standardised inputs: one width of the prior serves all slopes.
+        self.centre: Array = inputs.mean(axis=0)
+        unit = inputs.std(axis=0)
+        self.unit: Array = np.where(unit > 0, unit, 1.0)
+
+    def linearised(self, c: Array, rows: Rows) -> tuple[Array, Array]:
+        """Design (·, K, q) and target (·, K) of some samples about c, over h."""
+        y, G, h = self._features(self._inputs[rows], c)
+        standardised = (self._inputs[rows] - self.centre) / self.unit
+        design = design_rows(G, standardised) / h[:, :, None]
+        return design, (self._outputs[rows] - y + G @ c) / h
+
+    def errors(self, mean: Array, rows: Rows) -> Array:
+        """Errors r (·, K) of some samples with the coefficients `mean`."""
+        p = self._features.n_parameters
+        y, G, h = self._features(self._inputs[rows], mean[:p])
+        standardised = (self._inputs[rows] - self.centre) / self.unit
+        design = design_rows(G, standardised) / h[:, :, None]
+        errors: Array = (self._outputs[rows] - y) / h - design[:, :, p:] @ mean[p:]
+        return errors
+
+
 @dataclass(frozen=True)
 class EmpiricalModel:
     """The estimate from M transitions.
@@ -224,7 +266,8 @@ class EmpiricalModel:
         centre, unit: by which inputs are standardised, (n+m,).
         mean: c, then W row by row for the inputs (1, s, a), standardised, (p + K(1+n+m),).
         covariance: that of the posterior of `mean`.
-        residuals: r, (M, K), of mean zero.
+        residuals: e, (M, K), of mean zero; r itself where it does not persist.
+        persistence: Φ, what the next sample keeps of r, (K, K); zero where errors are independent.
     """
 
     features: Features
@@ -233,6 +276,7 @@ class EmpiricalModel:
     mean: Array
     covariance: Array
     residuals: Array
+    persistence: Array
 
     @classmethod
     def fit(
@@ -241,24 +285,26 @@ class EmpiricalModel:
         inputs: Array,
         outputs: Array,
         settings: EmpiricalModelConfiguration,
-        earlier_residuals: Array | None = None,
+        earlier: EmpiricalModel | None = None,
     ) -> EmpiricalModel:
-        """Estimate from transitions.
+        """Estimate from consecutive transitions.
 
         Args:
             features: the nominal model.
             inputs: (s, a), (M, n+m).
             outputs: (s₊, ℓ), (M, K).
             settings: prior and rounds.
-            earlier_residuals: of an earlier estimate, (·, K); they are kept beside the new ones.
+            earlier: an earlier estimate, whose residuals are kept beside the new ones, and whose Φ
+                counts as if they had been seen here.
         """
         p = features.n_parameters
-        if earlier_residuals is None:
-            earlier_residuals = np.empty((0, features.n_outputs))
-        # Standardised inputs: one width of the prior serves all slopes.
-        centre = inputs.mean(axis=0)
-        unit = inputs.std(axis=0)
-        unit = np.where(unit > 0, unit, 1.0)
+        K = features.n_outputs
+        earlier_residuals = np.empty((0, K))
+        earlier_persistence = np.zeros((K, K))
+        if earlier is not None:
+            earlier_residuals = earlier.residuals
+            earlier_persistence = earlier.persistence
+        regression = _Regression(features, inputs, outputs)
 
         # All fits but the last take every `thinning`-th sample.
         thinning = max(len(inputs) // settings.fit_samples, 1)
@@ -267,35 +313,56 @@ class EmpiricalModel:
         nominal_errors = outputs[::thinning] - y
         # The sizes of the nominal model's errors set the widths of W.
         priors = _priors(nominal_errors, y, features, settings)
-        residuals = nominal_errors / h
-        residuals = residuals - residuals.mean(axis=0)
         least_variance = INTEGRATION_ERROR**2 * ((y / h) ** 2).mean(axis=0)
 
+        def split(mean: Array, step: int) -> tuple[Array, Array]:
+            """Errors of every so many samples, as residuals and Φ."""
+            errors = regression.errors(mean, np.arange(0, len(inputs), step))
+            before = errors[:-1]
+            if step > 1:
+                before = regression.errors(mean, np.arange(step, len(inputs), step) - 1)
+            persistence = estimated(
+                errors[1:],
+                before,
+                settings.persistence_doubt,
+                earlier_persistence,
+                len(earlier_residuals),
+            )
+            if persistence.any():
+                errors = errors[1:] - before @ persistence.T
+            return errors - errors.mean(axis=0), persistence
+
+        # Φ begins at that of the nominal errors: W, fitted to states that persistent errors have
+        # moved, would take these for its own, and leave none that persist.
+        residuals, persistence = split(np.zeros(priors[0].size), thinning)
         for step in [thinning] * (settings.fit_rounds - 1) + [1]:
-            some_inputs = inputs[::step]
-            some_outputs = outputs[::step]
             # Residuals from before a change help to size the noise of a young regime.
             known = np.concatenate([residuals, earlier_residuals])
             noise = known.T @ known / len(known)
             variance = np.diag(noise)
             missing = np.maximum(least_variance - variance, 1e-9 * variance)
             noise = noise + np.diag(missing)
-            y, G, h = features(some_inputs, c)
-            standardised = (some_inputs - centre) / unit
-            design = design_rows(G, standardised) / h[:, :, None]
+            # In closed loop no slope can be told from what persists: states and actions follow.
+            widths = priors[-1:] if persistence.any() else priors
             # Linearised at the present c: a Gauss-Newton step.
-            target = (some_outputs - y + G @ c) / h
-            mean, covariance = _posterior(design, target, noise, priors)
+            rows = np.arange(0, len(inputs), step)
+            design, target = regression.linearised(c, rows)
+            if persistence.any():
+                # What persists of the error before is no news (Cochrane and Orcutt 1949).
+                design_before, target_before = regression.linearised(c, rows[1:] - 1)
+                design = design[1:] - persistence @ design_before
+                target = target[1:] - target_before @ persistence.T
+            mean, covariance = _posterior(design, target, noise, widths)
             largest = settings.largest_parameter_error
             c = mean[:p].clip(-largest, largest)
             # Beyond its largest error a parameter means another plant, not a fit.
             mean[:p] = c
-            y, _, _ = features(some_inputs, c)
-            linear_part = design[:, :, p:] @ mean[p:]
-            residuals = (some_outputs - y) / h - linear_part
+            residuals, persistence = split(mean, step)
 
-        residuals = np.concatenate([residuals - residuals.mean(axis=0), earlier_residuals])
-        return cls(features, centre, unit, mean, covariance, residuals)
+        residuals = np.concatenate([residuals, earlier_residuals])
+        centre = regression.centre
+        unit = regression.unit
+        return cls(features, centre, unit, mean, covariance, residuals, persistence)
 
     def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
         """Predictions at inputs (s, a), (M, n+m).
@@ -340,6 +407,26 @@ class EmpiricalModel:
         return np.cov(self.residuals.T)
 
     @property
+    def error_covariance(self) -> Array:
+        """Covariance of r, (K, K), which is e's where r does not persist."""
+        return error_covariance(self.persistence, self.noise)
+
+    @property
+    def error_deviation(self) -> Array:
+        """Standard deviation of r, (K,)."""
+        growth = np.diag(self.error_covariance) / np.diag(self.noise)
+        deviation: Array = self.residuals.std(axis=0) * np.sqrt(growth)
+        return deviation
+
+    def mean_error_covariance(self, count: int) -> Array:
+        """Covariance of the mean of so many consecutive r, (K, K)."""
+        return mean_error_covariance(self.persistence, self.noise, count)
+
+    def effective_number(self, count: int) -> float:
+        """Number of independent errors that would say as much as so many consecutive r."""
+        return effective_number(self.persistence, count)
+
+    @property
     def coefficients(self) -> tuple[Array, Array]:
         """c (p,) and W (K, 1+n+m) for inputs in their own units."""
         p = self.features.n_parameters
@@ -356,6 +443,7 @@ class EmpiricalModel:
             "mean": self.mean,
             "covariance": self.covariance,
             "residuals": self.residuals,
+            "persistence": self.persistence,
         }
 
 
@@ -401,7 +489,7 @@ def _priors(
     deviation = errors.std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
     parameters = np.full(features.n_parameters, settings.parameter_deviation)
     priors = []
-    for slope in settings.slope_deviations:
+    for slope in sorted(settings.slope_deviations, reverse=True):
         row = [1.0] + [slope] * features.n_inputs
         priors.append(np.append(parameters, np.outer(deviation, row)))
     return priors

@@ -18,7 +18,7 @@ from cosim.core.protocols import Matrix, Vector
 from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off import DEFAULT_BUDGET, backed_off_by_errors
 from learning.checkpoint import State
-from learning.configuration import Configuration, Count, GreedyConfiguration, Positive
+from learning.configuration import Configuration, Count, GreedyConfiguration
 from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel
 from learning.step import update_without_fit
@@ -39,7 +39,6 @@ class IdentifiedConfiguration(GreedyConfiguration):
         None,
         description="samples between two fits, each to these; a shift's if not given",
     )
-    shift_hours: Positive = Field(8.0, description="hours of a shift")
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """The parameters to fit."""

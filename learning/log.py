@@ -12,6 +12,7 @@ METRICS = ("economic_cost", "mean_violation", "violating_share", "J", "failures"
 """What an evaluation says of a greedy policy, means over its runs (failures: their sum)."""
 LOG_COLUMNS = (
     "samples", "updates", "J", "td_error", "step", "smallest_eigenvalue", "corrected", "refused",
+    "retreats",
     "failures", "explored", "saturated", "weakly_active", "licq_failed", "plant_samples",
     "greedy_J", "greedy_economic_cost", "greedy_mean_violation", "greedy_violating_share",
     "greedy_failures", "regret", "gap_closed",

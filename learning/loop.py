@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from math import inf
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
 from learning.errors import PrivilegeError
 from learning.exploration import Strategy
+from learning.retreat import Retreat
+from learning.step import update_without_fit
 
 FLAGS_EVERY = 10
 """Samples between two checks of a solution's flags, which cost as much as a feedback."""
@@ -76,6 +78,7 @@ class TrainingLoop:
         rng: draws the exploration.
         rest_after: samples after which θ stays and nothing explores; None: never.
         algorithm_rng: the rule's own generator, which checkpoints keep.
+        retreat: says when θ goes back to a better one; None: never.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class TrainingLoop:
         rng: np.random.Generator,
         rest_after: int | None = None,
         algorithm_rng: np.random.Generator | None = None,
+        retreat: Retreat | None = None,
     ) -> None:
         scenario = plant.scenario
         # A rule in operation cannot reach the plant, not even by an attribute.
@@ -103,6 +107,7 @@ class TrainingLoop:
         self.rng = rng
         self._algorithm_rng = algorithm_rng
         self._strategy = strategy
+        self._retreat = retreat
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
         self._penalty = scenario.state_penalty
@@ -159,10 +164,17 @@ class TrainingLoop:
         if has_ended:
             return cost, None
         update: Update | None = None
-        if transition is not None:
+        if self._waits:
+            # θ stays after a retreat; what happens then may still be remembered.
+            if transition is not None and hasattr(self.algorithm, "watch"):
+                self.algorithm.watch(transition)
+        elif transition is not None:
             update = self.algorithm.observe(transition)
         elif hasattr(self.algorithm, "failed"):
             update = self.algorithm.failed(cost)
+        if update is not None and update.lost and self._retreat is not None:
+            self._go_back(self._retreat.best_theta)
+        update = self._compared(cost) or update
         if update is None:
             return cost, None
         self.counts.failures += update.failures
@@ -173,6 +185,32 @@ class TrainingLoop:
         else:
             self.renew()
         return cost, update
+
+    @property
+    def _waits(self) -> bool:
+        """Whether θ stays as it is, after a retreat."""
+        return self._retreat is not None and self._retreat.samples_to_wait > 0
+
+    def _compared(self, cost: float) -> Update | None:
+        """Compare the cost of the shift that a sample may end; the update of a retreat."""
+        if self._retreat is None:
+            return None
+        theta = self.controller.theta
+        predicted = getattr(self.algorithm, "predicted_cost", nan)
+        back = self._retreat.observe(cost, theta, predicted)
+        if back is None:
+            return None
+        self._go_back(back)
+        blocks = self.controller.parameters.blocks
+        return update_without_fit(blocks, theta, back)._replace(retreated=True)
+
+    def _go_back(self, theta: Vector) -> None:
+        """Set θ back and tell the rule."""
+        if np.array_equal(theta, self.controller.theta):
+            return
+        self.controller.theta = theta
+        if hasattr(self.algorithm, "retreat"):
+            self.algorithm.retreat()
 
     def renew(self) -> None:
         """Solve again for the present state at the same linearisation point, after θ has moved."""
@@ -293,6 +331,8 @@ class TrainingLoop:
             law: Any = self._law
             state |= prefixed("estimator", law.state_dict())
         state |= prefixed("counts", asdict(self.counts))
+        if self._retreat is not None:
+            state |= prefixed("retreat", self._retreat.state_dict())
         state |= prefixed("algorithm", self.algorithm.state_dict())
         return state
 
@@ -308,6 +348,8 @@ class TrainingLoop:
             law: Any = self._law
             law.load_state_dict(part_of(state, "estimator"))
         self.counts = Counts(**part_of(state, "counts"))
+        if self._retreat is not None:
+            self._retreat.load_state_dict(part_of(state, "retreat"))
         self.algorithm.load_state_dict(part_of(state, "algorithm"))
         # Only now: a rule may draw while it restores itself.
         set_generator_state(self.rng, state["rng"])

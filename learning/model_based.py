@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
+from scipy.special import ndtr, stdtrit
 
 from controllers.economic import tune
 from controllers.errors import TuningError
@@ -132,6 +133,11 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
         description="standard deviations of a difference of costs within which the model cannot "
         "tell",
     )
+    persistent_doubt: NonNegative = Field(
+        3.0,
+        description="the same where errors persist, of which the model knows the first order "
+        "alone; θ then moves only where its cost is below the present one by as much",
+    )
     plateau: Positive = Field(
         2e-5,
         description="least deviation of such a difference, as a share of the cost",
@@ -169,15 +175,15 @@ class ModelBased(Algorithm):
         self._rollout = Rollout(self._problem, start, self._features)
         self._data = PlantData(self._features, settings)
         # A start that is backed off already is not given away.
-        lower = start["x_l"] - self._base["x_l"]
-        upper = self._base["x_u"] - start["x_u"]
-        self.back_off: Array = np.maximum(np.concatenate([lower, upper]), 0.0)
+        self.back_off: Array = self._back_offs(start)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
         self._due = settings.first_update  # samples at the next update
         self._regime_start = 0  # of the latest update
         self._floor = np.zeros_like(self.back_off)  # back-offs when that regime began
         # Of the mean cost, for each window of the change detection.
         self._limits: Array = np.full(len(settings.change_windows), np.inf)
+        self.predicted_cost = float("nan")
+        """What the model predicts of θ, mean cost per sample; NaN before the first update."""
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
 
@@ -199,6 +205,24 @@ class ModelBased(Algorithm):
             return self._update(alarmed)
         return None
 
+    def watch(self, transition: Transition) -> None:
+        """Keep a transition; θ stays."""
+        self._data.add(transition)
+
+    def retreat(self) -> None:
+        """Take the back-offs of the θ to which the loop has gone back; nothing is predicted."""
+        self.back_off = self._back_offs(self.controller.parameters)
+        self._floor = np.zeros_like(self.back_off)
+        self._limits[:] = np.inf
+        self.predicted_cost = np.nan
+
+    def _back_offs(self, theta: Parameters) -> Array:
+        """Back-offs of θ from the true bounds, lower then upper ones, (2n,)."""
+        lower = theta["x_l"] - self._base["x_l"]
+        upper = self._base["x_u"] - theta["x_u"]
+        back_offs: Array = np.maximum(np.concatenate([lower, upper]), 0.0)
+        return back_offs
+
     def alarmed(self, model: EmpiricalModel) -> bool:
         """Whether samples cost more than was predicted or, on new data, the plant is another."""
         settings = self.configuration
@@ -219,11 +243,20 @@ class ModelBased(Algorithm):
         """Fit the model, search on it, and move θ where the model predicts less for the new one."""
         settings = self.configuration
         data = self._data
-        model = data.fit()
+        present = self.controller.parameters
+        model = self._fitted()
+        if model is None:
+            # A plant that has run away leaves no model: ask again soon.
+            self._due = data.count + settings.change_windows[-2]
+            stays = update_without_fit(present.blocks, present.theta, present.theta, refused=True)
+            return stays._replace(lost=True)
         inputs, _ = data.present
         if data.regime_start != self._regime_start:
+            # A regime that was young itself had a floor of before.
+            young = data.regime_start - self._regime_start < settings.steady_samples
+            floored = young and self._regime_start > 0
+            self._floor = np.minimum(self._floor, self.back_off) if floored else self.back_off
             self._regime_start = data.regime_start
-            self._floor = self.back_off
         # Day by day an optimum moves little: then the search begins at the present back-offs.
         # Without limits the present cost was never predicted.
         known = bool(np.isfinite(self._limits).all())
@@ -233,7 +266,6 @@ class ModelBased(Algorithm):
         # Data double between updates, then grow by a share.
         self._due = data.count + max(interval, settings.first_update)
 
-        present = self.controller.parameters
         latest, _ = data.latest(settings.recent_samples)
         base, gained = self.corrected(present, model, inputs[-settings.recent_samples :])
         # What c_f and the parameters correct, back-offs need not hold any more.
@@ -250,17 +282,35 @@ class ModelBased(Algorithm):
         new = search.theta(best)
         search.draw(settings.fine_rollout)
         cost_of_new, cost_of_present = search.predicted_costs([new, present.theta])
-        better = search.excess(cost_of_new, cost_of_present) <= 0
+        least_gain = search.doubt if model.persistence.any() else 0.0
+        better = search.excess(cost_of_new, cost_of_present) <= -least_gain
         self._limits = (cost_of_new if better else cost_of_present).limits
-        if not np.isfinite(self._limits).all():
-            # Nothing is known of the present cost: look again soon.
-            self._due = min(self._due, data.count + settings.change_windows[-2])
+        self.predicted_cost = (cost_of_new if better else cost_of_present).cost
         if better:
             self.back_off = best
             self.controller.theta = new
+        lost = not np.isfinite(self._limits).all()
+        if lost:
+            # Nothing is known of any cost: look again soon.
+            self._due = min(self._due, data.count + settings.change_windows[-2])
         self.model_samples += search.n_samples
         end = self.controller.theta
-        return update_without_fit(present.blocks, present.theta, end, refused=not better)
+        update = update_without_fit(present.blocks, present.theta, end, refused=not better)
+        return update._replace(lost=lost)
+
+    def _fitted(self) -> EmpiricalModel | None:
+        """The model of the present plant; None where its data or predictions are not finite."""
+        latest, outputs = self._data.latest(self.configuration.recent_samples)
+        if not np.isfinite(outputs).all():
+            return None
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                model = self._data.fit()
+                predicted, h, _ = model.predict(latest)
+        except np.linalg.LinAlgError:
+            return None
+        finite = np.isfinite(predicted).all() and np.isfinite(h).all()
+        return model if finite and np.isfinite(model.noise).all() else None
 
     def least_back_offs(self, present: Array, inputs: Array) -> Array:
         """Least back-offs that the data allow.
@@ -334,6 +384,7 @@ class ModelBased(Algorithm):
             "due": self._due,
             "model_samples": self.model_samples,
             "limits": self._limits,
+            "predicted_cost": self.predicted_cost,
             "floor": self._floor,
             "regime_start": self._regime_start,
             **prefixed("data", self._data.state_dict()),
@@ -345,6 +396,7 @@ class ModelBased(Algorithm):
         self._due = state["due"]
         self.model_samples = state["model_samples"]
         self._limits = state["limits"]
+        self.predicted_cost = state["predicted_cost"]
         self._floor = state["floor"]
         self._regime_start = state["regime_start"]
         self._data.load_state_dict(part_of(state, "data"))
@@ -420,6 +472,7 @@ class BackOffOnModel:
     Attributes:
         n_samples: of rollouts so far.
         unit: of the back-offs, the standard deviation of the one-step error, (2n,).
+        doubt: deviations of a difference of costs within which the model cannot tell.
     """
 
     def __init__(
@@ -450,12 +503,17 @@ class BackOffOnModel:
         if len(visited) < settings.recent_samples:
             self._reach[:] = np.inf  # the plant has not settled yet
         # The size of a one-step error, at least a millionth of the state's own unit.
-        residual = model.residuals[:, :n].std(axis=0)
-        deviation = residual * h[:, :n].mean(axis=0)
+        deviation = model.error_deviation[:n] * h[:, :n].mean(axis=0)
         deviation = np.maximum(deviation, 1e-6 * problem.units.state)
         self.unit = np.tile(deviation, 2)
         distance = problem.state_upper - problem.state_lower
         self._most = np.tile(settings.largest_back_off * distance, 2)
+        self.doubt = settings.doubt
+        if model.persistence.any():
+            # Student's: few independent errors hardly know their own size.
+            n_independent = model.effective_number(len(model.residuals))
+            tail = ndtr(settings.persistent_doubt)
+            self.doubt = float(stdtrit(n_independent, tail))
         self._penalty_share = np.zeros(2 * n)  # largest of each bound so far
         self.n_samples = 0
         self.draw(settings.coarse_rollout)
@@ -498,8 +556,11 @@ class BackOffOnModel:
         if not complete or not np.isfinite(predicted).all():
             return lost
         # A rollout counts once it has settled.
-        costs, penalties = self._costs(predicted, h)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
+            costs, penalties = self._costs(predicted, h)
         cost = float(costs.mean())
+        if not np.isfinite(cost):
+            return lost
         stage_cost = float(predicted[:, -1].mean())
         size = max(abs(stage_cost), np.finfo(np.float64).eps)
         # A bound shows in lost rollouts too.
@@ -622,7 +683,7 @@ class BackOffOnModel:
         costs = self.predicted_costs([self.theta(point) for point in points])
         free = delta
         for point, cost in zip(points, costs, strict=True):
-            if self.excess(cost, costs[0]) <= self._settings.doubt:
+            if self.excess(cost, costs[0]) <= self.doubt:
                 free = point
         return free
 
@@ -643,7 +704,7 @@ class BackOffOnModel:
         # Of what the model cannot tell apart, the smallest back-off.
         close = []
         for point, cost in zip(points, costs, strict=True):
-            if self.excess(cost, least) <= self._settings.doubt:
+            if self.excess(cost, least) <= self.doubt:
                 close.append(point)
 
         def size(point: Array) -> float:

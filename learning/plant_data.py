@@ -6,6 +6,7 @@ A regime lies between two changes of the plant. Only its data count in the model
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +22,9 @@ class Predictions(NamedTuple):
     """What a model says of T samples, and what became of them.
 
     Attributes:
-        outputs: predicted (s₊, ℓ) without residual, (T, K).
+        outputs: predicted (s₊, ℓ) without residual, with what persists of the error before, (T, K).
         h: sizes of the errors, (T, K).
-        errors: prediction errors over h, (T, K).
+        errors: all of the prediction errors r, over h, (T, K).
         designs: derivative of the predictions by the model's coefficients over h, (T, K, q).
     """
 
@@ -55,8 +56,7 @@ class PlantData:
         self.count_at_fit = 0
         # A ring of transitions (s, a, s₊, ℓ).
         self._rows = np.zeros((settings.memory, features.n_inputs + features.n_outputs))
-        # From before the last change of the plant.
-        self._earlier_residuals = np.zeros((0, features.n_outputs))
+        self._earlier: EmpiricalModel | None = None  # from before the last change of the plant
         # Of the samples since the fit, a block for each `change_windows[0]` of them.
         self._blocks: list[Predictions] = []
 
@@ -99,7 +99,9 @@ class PlantData:
             inputs, outputs = self.present
         # Residuals from before a change fill up those of a young regime.
         room = max(self.settings.earlier_residuals - len(inputs), 0)
-        earlier = self._earlier_residuals[:room]
+        earlier = self._earlier
+        if earlier is not None:
+            earlier = replace(earlier, residuals=earlier.residuals[:room])
         model = EmpiricalModel.fit(self.features, inputs, outputs, self.settings, earlier)
         self.model = model
         self.count_at_fit = self.count
@@ -124,14 +126,15 @@ class PlantData:
             models.append(
                 EmpiricalModel.fit(self.features, inputs[part], outputs[part], self.settings)
             )
-        # Both are judged by the noise of the newer model.
-        precision = np.linalg.pinv(models[1].noise)
+        # Both are judged by the noise of the newer model, and by as many errors as are independent.
+        precision = np.linalg.pinv(models[1].error_covariance)
+        share = models[1].effective_number(n_latest) / n_latest
         losses = []
         for model in models:
             predicted, h, _ = model.predict(inputs[-n_latest:])
             errors = (outputs[-n_latest:] - predicted) / h
             squares = float(np.einsum("mi,ij,mj->", errors, precision, errors))
-            losses.append(squares / 2)
+            losses.append(share * squares / 2)
         evidence = losses[0] - losses[1]
         return n_older if evidence > self.settings.forecast_evidence else 0
 
@@ -146,11 +149,18 @@ class PlantData:
         block = windows[0]
         # Blocks that are known need not be predicted again.
         new = self.since_fit - block * len(self._blocks)
-        inputs, outputs = self.latest(new)
-        for first in range(0, len(inputs) - block + 1, block):
+        # One more, if there is one: its error persists in part.
+        inputs, outputs = self.latest(new + 1)
+        for first in range(len(inputs) - new, len(inputs) - block + 1, block):
             part = slice(first, first + block)
             predicted, h, designs = self.model.predict(inputs[part])
             errors = (outputs[part] - predicted) / h
+            if first > 0 and self.model.persistence.any():
+                before = slice(first - 1, first)
+                predicted_before, h_before, _ = self.model.predict(inputs[before])
+                error_before = (outputs[before] - predicted_before) / h_before
+                errors_before = np.concatenate([error_before, errors[:-1]])
+                predicted = predicted + h * (errors_before @ self.model.persistence.T)
             self._blocks.append(Predictions(predicted, h, errors, designs))
         latest = self._blocks[-windows[-1] // block :]
         columns = [np.concatenate(column) for column in zip(*latest, strict=True)]
@@ -167,13 +177,18 @@ class PlantData:
         """
         model = self.model
         assert model is not None
-        M, K = model.residuals.shape
+        K = self.features.n_outputs
+        M = model.effective_number(len(model.residuals))
+        # So few independent errors say nothing of their own size.
+        if M <= K + 1:
+            return False
         for window in self.settings.change_windows:
             if window > len(predictions.errors):
                 break
             mean = predictions.errors[-window:].mean(axis=0)
             design = predictions.designs[-window:].mean(axis=0)
-            covariance = model.noise / window + design @ model.covariance @ design.T
+            covariance = model.mean_error_covariance(window)
+            covariance = covariance + design @ model.covariance @ design.T
             # Hotelling's T², of the mean's own noise and of what the model does not know.
             statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
             probability = fdtrc(K, M - K, max(statistic, 0.0))
@@ -183,7 +198,8 @@ class PlantData:
             if probability < limit:
                 # Samples before the window are of another plant; its residuals are kept.
                 self.regime_start = self.count - window
-                self._earlier_residuals = model.residuals[-self.settings.earlier_residuals :]
+                latest = model.residuals[-self.settings.earlier_residuals :]
+                self._earlier = replace(model, residuals=latest)
                 return True
         return False
 
@@ -191,23 +207,24 @@ class PlantData:
         """The transitions, the regime and the model."""
         state: State = {
             "rows": self._rows,
-            "earlier_residuals": self._earlier_residuals,
             "count": self.count,
             "regime_start": self.regime_start,
             "count_at_fit": self.count_at_fit,
         }
-        if self.model is not None:
-            state |= prefixed("model", self.model.state_dict())
+        for name, model in (("model", self.model), ("earlier", self._earlier)):
+            if model is not None:
+                state |= prefixed(name, model.state_dict())
         return state
 
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned; predictions since the fit are made anew."""
         self._rows = state["rows"]
-        self._earlier_residuals = state["earlier_residuals"]
         self.count = state["count"]
         self.regime_start = state["regime_start"]
         self.count_at_fit = state["count_at_fit"]
         self._blocks = []
-        # Before the first fit there is none.
+        # Before the first fit there is no model, before the first change no earlier one.
         model = part_of(state, "model")
         self.model = EmpiricalModel(self.features, **model) if model else None
+        earlier = part_of(state, "earlier")
+        self._earlier = EmpiricalModel(self.features, **earlier) if earlier else None

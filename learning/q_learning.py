@@ -437,6 +437,11 @@ class QLearning(ValueRule):
         self._count = 0
         self._warm_up = []
 
+    def retreat(self) -> None:
+        """Begin anew at the θ to which the loop has gone back."""
+        self.begin_anew()
+        self._sum_of_squares = 0.0
+
     def state_dict(self) -> State:
         """What `ValueRule` keeps, the warm-up's rows, and the regression."""
         return {

@@ -11,10 +11,11 @@
 int nominal(const double **arguments, double **results, long long int *iw, double *w, int memory);
 
 /* An empirical model: `c` and `W`, a row (1, s, a) an output, are its coefficients. Sample k meets the
- * residual picks[k]. `output` is y(s, a; c) + W (1, s, a), and h. */
+ * residual picks[k], beside what persists of the `error` before. `output` is y(s, a; c) + W (1, s, a)
+ * with the latter, and h. */
 typedef struct {
-    double inputs[N_W], output[2 * K];
-    const double *c, *W, *residuals;
+    double inputs[N_W], output[2 * K], error[K];
+    const double *c, *W, *persistence, *residuals;
     const int32_t *picks;
 } Empirical;
 
@@ -34,6 +35,12 @@ static int empirical_step(void *plant, long long sample, int *status) {
         for (int j = 0; j < N_W; j++) predicted[i] += row[1 + j] * model->inputs[j];
     }
     const double *const residual = model->residuals + (int64_t)model->picks[sample] * K;
+    double persists[K] = {0.0};
+    for (int i = 0; i < K; i++) {
+        for (int j = 0; j < K; j++) persists[i] += model->persistence[i * K + j] * model->error[j];
+        predicted[i] += h[i] * persists[i];
+    }
+    for (int i = 0; i < K; i++) model->error[i] = persists[i] + residual[i];
     for (int i = 0; i < N_X; i++) model->inputs[i] = predicted[i] + h[i] * residual[i];
     return OK;
 }
@@ -43,11 +50,14 @@ size_t rollout_columns(void) { return N_W + 2 * K + LOOP_COLUMNS; }
 /* `steps` samples from the state `start`, a row of `table` each (`loop_run`). Returns the number of the
  * samples before one whose state is not finite, else `steps`. */
 int rollout(const double theta[], const double start[], const double c[], const double W[],
-            const double residuals[], const int32_t picks[], int steps, double *table) {
+            const double persistence[], const double residuals[], const int32_t picks[], int steps,
+            double *table) {
     QP_SCRATCH RtiPrepared prepared;
     QP_SCRATCH RtiSolved solved;
     QP_SCRATCH RtiWork work;
-    Empirical model = {.c = c, .W = W, .residuals = residuals, .picks = picks};
+    Empirical model = {
+        .c = c, .W = W, .persistence = persistence, .residuals = residuals, .picks = picks,
+    };
     const LoopPlant plant = {
         empirical_step, &model, model.inputs + N_X, model.inputs, model.output, 2 * K,
     };

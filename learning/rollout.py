@@ -27,7 +27,7 @@ class RolloutSamples(NamedTuple):
 
     Attributes:
         inputs: (s, a), (T, n+m).
-        predicted: (s₊, ℓ) without residual, (T, K).
+        predicted: (s₊, ℓ) without residual, with what persists of the error before, (T, K).
         h: sizes of the errors, (T, K).
     """
 
@@ -115,7 +115,7 @@ class Rollout:
         c, W = model.coefficients
         # C reads rows, one after the other.
         arguments = []
-        for array in (theta, start, c, W, model.residuals, picks):
+        for array in (theta, start, c, W, model.persistence, model.residuals, picks):
             arguments.append(np.ascontiguousarray(array))
         assert self.compiled is not None
         # A row is the one of every closed loop: state and action, the plant's outputs, and more.
@@ -171,6 +171,7 @@ class ModelledPlant:
         self._c, self._W = model.coefficients
         self._picks = picks
         self._s = start
+        self._error = np.zeros(features.n_outputs)  # r of the sample before
         self._number = 0
         self.inputs = np.empty((n_samples, features.n_inputs))
         self.predicted = np.empty((n_samples, features.n_outputs))
@@ -183,9 +184,12 @@ class ModelledPlant:
         inputs = np.concatenate([self._s, a])
         y, h = self._model.features.mean(self._s, a, self._c)
         self.inputs[number] = inputs
-        self.predicted[number] = y.full()[:, 0] + self._W @ np.append(1.0, inputs)
         self.h[number] = h.full()[:, 0]
+        persists = self._model.persistence @ self._error
+        predicted = y.full()[:, 0] + self._W @ np.append(1.0, inputs)
+        self.predicted[number] = predicted + self.h[number] * persists
         residual = self._model.residuals[self._picks[number]]
+        self._error = persists + residual
         outcome = self.predicted[number] + self.h[number] * residual
         self._s = outcome[:-1]
         self._number = number + 1

@@ -106,6 +106,7 @@ class Training(Result):
             "difference": shown(*self.difference, digits=3),
             "verdict": self.verdict,
             "updates": self.updates,
+            "retreats": self.retreats,
             "regret": self.regret,
         }
 
@@ -140,6 +141,11 @@ class Training(Result):
     def updates(self) -> int:
         """Updates of θ in all."""
         return int(_total(row["updates"] for row in self.rows))
+
+    @property
+    def retreats(self) -> int:
+        """How often θ went back to one that had been shown to cost less."""
+        return int(_total(row["retreats"] for row in self.rows))
 
     @property
     def regret(self) -> float:
@@ -257,6 +263,7 @@ class Training(Result):
             "hyperparameters": run.configuration.model_dump(mode="json"),
             "verdict": self.verdict,
             "updates": self.updates,
+            "retreats": self.retreats,
             "parameters_hash": self.parameters.hash,
             "evaluation_seeds": run.evaluation_seeds,
             "evaluation_steps": run.evaluation_steps,
@@ -480,7 +487,7 @@ class _Session:
         counts = dict.fromkeys(asdict(self.loop.counts), 0)
         counts.pop("number")
         metrics |= {"samples": 0, "plant_samples": 0, **counts}
-        metrics |= dict.fromkeys(("updates", "corrected", "refused"), 0)
+        metrics |= dict.fromkeys(("updates", "corrected", "refused", "retreats"), 0)
         metrics["smallest_eigenvalue"] = smallest_eigenvalue(self.start.blocks, self.start.theta)
         metrics |= _greedy(evaluator.start)
         return LogRow(metrics, self.start)
@@ -507,6 +514,7 @@ class _Session:
         metrics["smallest_eigenvalue"] = smallest
         metrics["corrected"] = sum(update.corrected for update in updates)
         metrics["refused"] = sum(update.refused for update in updates)
+        metrics["retreats"] = sum(update.retreated for update in updates)
         metrics["plant_samples"] = counts.pop("number")
         metrics |= counts
         self.costs = []

@@ -16,6 +16,7 @@ from controllers.economic import tune
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
+from cosim.core.protocols import Vector
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import spawn_seeds
 from cosim.core.training_options import HELD_OUT, MOST, Range, TrainingOptions, option_ranges
@@ -28,6 +29,7 @@ from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.exploration import Strategy
 from learning.loop import TrainingLoop
+from learning.retreat import Retreat
 
 DEFAULT_SAMPLES = 50_000
 """Length of a run where neither user nor algorithm states one."""
@@ -238,7 +240,16 @@ def begin_training(
     rule = algorithm(
         controller, run.scenario, run.configuration, run.samples, strategy, algorithm_rng
     )
-    loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, algorithm_rng)
+    loop = TrainingLoop(
+        plant,
+        controller,
+        rule,
+        strategy,
+        rng,
+        run.rest_after,
+        algorithm_rng,
+        _retreat(run, rule, controller.theta),
+    )
     first_episode = getattr(rule, "first_episode", None)
     if first_episode is None:
         loop.start(plant.reset(plant_seed), plant.y)
@@ -246,6 +257,20 @@ def begin_training(
         simulator = loop.simulator("first_episode")
         loop.start(simulator.reset(first_episode), simulator.y)
     return loop
+
+
+def _retreat(
+    run: TrainingRun,
+    rule: Algorithm,
+    start: Vector,
+) -> Retreat | None:
+    """What compares a run's shifts; None for a rule that tries θ, on the plant or a simulator."""
+    configuration = run.configuration
+    tries = rule.requires == "simulator" or hasattr(rule, "theta")
+    if tries or not configuration.retreat_probability:
+        return None
+    shift = round(3600.0 * configuration.shift_hours / run.scenario.sampling_time)
+    return Retreat(start, shift, configuration.retreat_probability)
 
 
 def starting_parameters(

@@ -147,6 +147,7 @@ def fitted():
         mean=np.zeros(size),
         covariance=np.zeros((size, size)),
         residuals=np.random.default_rng(1).uniform(-0.4, 0.4, (200, features.n_outputs)),
+        persistence=np.zeros((features.n_outputs, features.n_outputs)),
     )
 
 

@@ -1,0 +1,126 @@
+"""Errors that persist, r₊ = Φ r + e: the first-order autoregression of a model's prediction errors.
+
+A disturbance that lasts for more than a sample makes errors that are correlated in time. Their mean
+over a window is then less certain than that of as many independent ones, and what they were in one
+sample says something of the next.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cosim.core.protocols import Array
+
+LARGEST_PERSISTENCE = 0.99
+"""Largest spectral radius of Φ: errors that last for 100 samples. What lasts longer is a mean."""
+DOUBLINGS = 12
+"""Rounds of the sum Γ, 2¹² terms: at the largest radius what is left out is below rounding."""
+
+
+def estimated(
+    later: Array,
+    before: Array,
+    doubt: float,
+    earlier: Array,
+    n_earlier: int,
+) -> Array:
+    """Φ by least squares; zero where independent errors would look like it.
+
+    The likelihood ratio of Φ = 0 is a χ² of K² degrees of freedom where the errors are independent:
+    of mean K² and variance 2K².
+
+    Args:
+        later: r₊, (M, K).
+        before: r, (M, K).
+        doubt: standard deviations by which the ratio must exceed its mean.
+        earlier: an earlier estimate of Φ, (K, K), which counts as if it came from these errors.
+        n_earlier: number of errors of which that was one.
+
+    Returns:
+        Φ, (K, K), of spectral radius `LARGEST_PERSISTENCE` at most.
+    """
+    later = later - later.mean(axis=0)
+    before = before - before.mean(axis=0)
+    K = before.shape[1]
+    # In units of their size; an output without errors has none that persist.
+    size = before.std(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    scaled_later = later / size
+    scaled_before = before / size
+    solution = np.linalg.lstsq(scaled_before, scaled_later, rcond=1e-8)[0]
+    weight = n_earlier / (len(before) + n_earlier)
+    scaled_earlier = earlier.T * size[:, None] / size
+    solution = (1 - weight) * solution + weight * scaled_earlier
+    # Log-likelihoods of normal errors, with and without what persists.
+    innovations = scaled_later - scaled_before @ solution
+    ratio = len(before) * (_log_determinant(scaled_later) - _log_determinant(innovations))
+    if ratio <= K**2 + doubt * (2 * K**2) ** 0.5 and not weight:
+        return np.zeros((K, K))
+    persistence: Array = (solution / size[:, None] * size).T
+    return persistence * min(1.0, LARGEST_PERSISTENCE / max(_radius(persistence), 1e-9))
+
+
+def _log_determinant(values: Array) -> float:
+    """Log of the determinant of the covariance of values (M, K), of mean zero."""
+    covariance = values.T @ values / len(values)
+    floor = 1e-12 * np.eye(len(covariance))
+    return float(np.linalg.slogdet(covariance + floor)[1])
+
+
+def _radius(persistence: Array) -> float:
+    return float(np.abs(np.linalg.eigvals(persistence)).max())
+
+
+def error_covariance(persistence: Array, innovations: Array) -> Array:
+    """Covariance of r, (K, K), which solves Γ = Φ Γ Φᵀ + Σ.
+
+    Args:
+        persistence: Φ, (K, K).
+        innovations: Σ, the covariance of e, (K, K).
+    """
+    if not persistence.any():
+        return innovations
+    # Γ = Σ_k Φᵏ Σ Φᵏᵀ, twice as many terms in each round.
+    covariance = innovations
+    power = persistence
+    for _ in range(DOUBLINGS):
+        covariance = covariance + power @ covariance @ power.T
+        power = power @ power
+    return covariance
+
+
+def mean_error_covariance(persistence: Array, innovations: Array, count: int) -> Array:
+    """Covariance of the mean of consecutive r: Γ/T + Σ_k (1 − k/T) (Φᵏ Γ + Γ Φᵏᵀ)/T, k from 1.
+
+    Args:
+        persistence: Φ, (K, K).
+        innovations: Σ, the covariance of e, (K, K).
+        count: T, the number of r.
+
+    Returns:
+        The covariance, (K, K); of independent errors Σ/T.
+    """
+    if not persistence.any():
+        return innovations / count
+    gamma = error_covariance(persistence, innovations)
+    # Σ_k (1 − k/T) Φᵏ in closed form.
+    one = np.eye(len(persistence))
+    inverse = np.linalg.inv(one - persistence)
+    power = np.linalg.matrix_power(persistence, count)
+    remainder = persistence @ (one - power) @ inverse @ inverse / count
+    total = persistence @ inverse - remainder
+    covariance: Array = (gamma + total @ gamma + gamma @ total.T) / count
+    return covariance
+
+
+def effective_number(persistence: Array, count: int) -> float:
+    """Number of independent errors that say as much as so many consecutive ones.
+
+    That of a scalar autoregression with the spectral radius ρ of Φ, count (1 − ρ)/(1 + ρ).
+
+    Args:
+        persistence: Φ, (K, K).
+        count: of errors.
+    """
+    radius = _radius(persistence) if persistence.any() else 0.0
+    return count * (1 - radius) / (1 + radius)

@@ -31,6 +31,7 @@ def make_search(scenario, problem, tuned_theta, rng):
     residuals = np.column_stack([rng.uniform(-1.0, 1.0, (20_000, 1)), np.zeros((20_000, 2))])
     model = SimpleNamespace(residuals=residuals, mean=np.zeros(1), covariance=np.zeros((1, 1)))
     model.error_deviation = residuals.std(axis=0)
+    model.persistence = np.zeros((3, 3))
     model.cost_derivative = lambda inputs: np.zeros(1)
     model.predict = lambda at: (at[:, :3] * [1.0, 1.0, 0.0], np.ones((len(at), 3)), None)
 

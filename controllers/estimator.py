@@ -105,7 +105,7 @@ class ExtendedKalmanFilter:
         self._longest = int(self._delays.max())
         model = problem.model
         self._uncertain = model.parameter_indices(model.uncertain) if parameter_drift > 0 else []
-        self._transition = _transition(problem, self._uncertain)
+        self._transition = _transition_function(problem, self._uncertain)
         self._output = measured_outputs(problem, sensors, self._uncertain)
         # The filter's state z: the model's, and its uncertain parameters.
         nominal = model.nominal_parameters[self._uncertain]
@@ -441,7 +441,7 @@ def _with_uncertain(problem: Problem, uncertain: Sequence[int]) -> tuple[ca.SX, 
     return z, p
 
 
-def _transition(problem: Problem, uncertain: Sequence[int]) -> StackedFunction:
+def _transition_function(problem: Problem, uncertain: Sequence[int]) -> StackedFunction:
     """z₊, A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u)."""
     model = problem.model
     f = discretise(model, problem.sampling_time, problem.substeps)

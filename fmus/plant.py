@@ -22,7 +22,7 @@ _SHARED = (
 )  # fmt: skip
 
 
-LONGEST_TIME_CONSTANT = 1e6
+LARGEST_TIME_CONSTANT = 1e6
 """Largest time constant of a disturbance's filter, in s: eleven days."""
 
 
@@ -193,7 +193,7 @@ def _time_constant_of(disturbance: Signal) -> Variable:
         "s",
         start=disturbance.time_constant,
         min=0.0,
-        max=LONGEST_TIME_CONSTANT,
+        max=LARGEST_TIME_CONSTANT,
         description=f"time constant of the filter of the {disturbance.description}; "
         "0: drawn anew in each sample",
     )

@@ -14,18 +14,18 @@ from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.protocols import Matrix, Vector
-from cosim.core.scenario import Penalty, Scenario
+from cosim.core.scenario import Penalty, Positive, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
-from learning.configuration import Configuration, Count, ExplorationProbability, Positive
+from learning.configuration import Configuration, Count, ExplorationProbability
 from learning.errors import DivergenceError
 from learning.prediction_errors import PredictionErrors, SortedErrors, expected_penalties
 from learning.q_learning import ValueConfiguration, prior_deviation
 from learning.step import ConstrainedStep, Fit, policy_gradient_fit
 
-DIFFERENCE = 0.25
+DIFFERENCE_SHARE = 0.25
 """Distance, in standard deviations of the errors, over which expected penalties are differenced."""
-FLOOR = 1e-12
+LEAST_MULTIPLIER = 1e-12
 """Accuracy of the trust region's multiplier, and its least value, relative to the curvatures."""
 
 
@@ -353,7 +353,7 @@ class ExpectedPenalty:
         self._errors = SortedErrors(errors)
         # Errors that are all the same leave a kink: a distance that is tiny beside them.
         least = 1e-6 * (1.0 + np.abs(errors).max(axis=0))
-        self._distance = np.maximum(DIFFERENCE * errors.std(axis=0), least)
+        self._distance = np.maximum(DIFFERENCE_SHARE * errors.std(axis=0), least)
 
     def _by_state(self, predictions: Matrix) -> Matrix:
         """Expected penalty of each state's bounds, (n, K)."""
@@ -524,9 +524,9 @@ def trust_region_fit(
 
     # Where J has no curvature, only the region bounds the step, by this multiplier.
     steepest = float(np.linalg.norm(slopes)) / radius
-    multiplier = FLOOR * max(float(curvatures.max()), steepest) + np.finfo(float).tiny
+    multiplier = LEAST_MULTIPLIER * max(float(curvatures.max()), steepest) + np.finfo(float).tiny
     if excess(multiplier) > 0:
-        multiplier = brentq(excess, multiplier, multiplier + steepest, rtol=FLOOR)
+        multiplier = brentq(excess, multiplier, multiplier + steepest, rtol=LEAST_MULTIPLIER)
     dual = region @ vectors
     convex = (dual * curvatures) @ dual.T
     # α = 2 makes the metric H + μR that of dᵀ(H + μR)d/2.

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,17 +14,24 @@ from pydantic import Field
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.protocols import Matrix, Vector
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import Positive, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
-from learning.configuration import Configuration, Count, GreedyConfiguration, Positive, Share
+from learning.configuration import Configuration, Count, GreedyConfiguration, Share
 from learning.errors import ConfigurationError
 from learning.prediction_errors import OneStepModel, known_penalty
 from learning.step import update_without_fit
 
 DEFAULT_BUDGET = 8000
 """Samples of a practitioner's method where the user states none."""
-COARSE, MEDIUM, FINE = range(3)
+
+
+class Phase(IntEnum):
+    """The rounds of the search of one back-off, each finer than the last."""
+
+    COARSE = 0
+    MEDIUM = 1
+    FINE = 2
 
 
 class BackOffConfiguration(GreedyConfiguration):
@@ -129,7 +137,7 @@ class BackOffSearch:
         self.led_beyond = False
         self._unit: Vector = np.zeros(n)  # σ, known after the first segment
         self._active: Vector = np.zeros(2 * n)  # largest share of a first round's segment
-        # Rounds (bound, COARSE | MEDIUM | FINE); the first segment finds the bound of the first.
+        # Rounds (bound, Phase); the first segment finds the bound of the first.
         self._schedule: list[list[int]] = []
         self._round = 0
         self._candidates: Matrix = self.kappa[None].copy()  # κ of the round's segments, (S, 2n)
@@ -231,10 +239,10 @@ class BackOffSearch:
         errors = self._model.errors(states, actions, next_states, self.start)
         self._unit = errors.std(axis=0)
         first = int(np.argmax(self._active))
-        self._schedule = [[first, COARSE]]
+        self._schedule = [[first, Phase.COARSE]]
         self._keep(rows, 0.0)
         # The first round is about one bound; later rounds share the samples that it leaves.
-        length, self._candidates = self._round_at(first, COARSE, 1.0)
+        length, self._candidates = self._round_at(first, Phase.COARSE, 1.0)
         return length
 
     def _keep(self, rows: Matrix, kappa: float) -> None:
@@ -254,8 +262,12 @@ class BackOffSearch:
             active = self._active >= self.settings.active_share
             for other in np.flatnonzero(active).tolist():
                 if other != bound:
-                    self._schedule += [[other, COARSE], [other, MEDIUM], [other, FINE]]
-            self._schedule += [[bound, MEDIUM], [bound, FINE]]
+                    self._schedule += [
+                        [other, Phase.COARSE],
+                        [other, Phase.MEDIUM],
+                        [other, Phase.FINE],
+                    ]
+            self._schedule += [[bound, Phase.MEDIUM], [bound, Phase.FINE]]
         self._round += 1
         self._segment = 0
         if self._round == len(self._schedule):
@@ -263,12 +275,12 @@ class BackOffSearch:
             return 0
         bound, phase = self._schedule[self._round]
         # The samples of the medium round count in the fine one too.
-        if phase != FINE:
+        if phase != Phase.FINE:
             self._tried = self._tried[:0]
         shares = self.settings.round_shares
         # What the first round has left, over all rounds to come.
         total = sum(shares[later] for _, later in self._schedule[1:])
-        left = (self._shares - shares[COARSE]) / total
+        left = (self._shares - shares[Phase.COARSE]) / total
         length, self._candidates = self._round_at(bound, phase, left)
         return length
 
@@ -282,7 +294,7 @@ class BackOffSearch:
 
         Args:
             bound: whose κ is tried.
-            phase: COARSE, MEDIUM or FINE.
+            phase: Phase.COARSE, Phase.MEDIUM or Phase.FINE.
             left: factor of the round's share of the budget.
 
         Returns:
@@ -296,7 +308,7 @@ class BackOffSearch:
         steps = int(self._budget * left * share / parts)
         least = self._least(bound)
         back = max(least, -offsets[-1])
-        if phase == COARSE and back < -1.0:
+        if phase == Phase.COARSE and back < -1.0:
             offsets = (0.0, back, back / 2)  # of a start that is backed off, look for less
         candidates = np.tile(self.kappa, (len(offsets), 1))
         for row, offset in zip(candidates, offsets, strict=True):
@@ -333,7 +345,7 @@ class BackOffSearch:
         state = bound % n
         direction = 1 if bound < n else -1
         slope[1 + state] = self._unit[state] * direction
-        reach = settings.reach * (2 if phase == COARSE else 1)
+        reach = settings.reach * (2 if phase == Phase.COARSE else 1)
         # Costs of different κ share their mean; what differs is estimated.
         mean = float(costs.mean())
 

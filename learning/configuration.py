@@ -10,14 +10,12 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from controllers.model import Model
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import NonNegative, Positive, Scenario
 from cosim.core.validation import validated
 from learning.errors import ConfigurationError
 
 ALL = ("all",)
 """In place of names: every parameter of the controller's model."""
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # The rules differ in these four, so they have other defaults in each.

@@ -27,8 +27,9 @@ from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
 from cosim.core.protocols import Array
+from cosim.core.scenario import NonNegative, Positive
 from learning.checkpoint import State
-from learning.configuration import Configuration, Count, NonNegative, Positive, Share
+from learning.configuration import Configuration, Count, Share
 from learning.persistence import (
     effective_number,
     error_covariance,

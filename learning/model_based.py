@@ -23,16 +23,10 @@ from controllers.errors import TuningError
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.protocols import Array
+from cosim.core.scenario import NonNegative, Positive
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
-from learning.configuration import (
-    ALL,
-    Count,
-    ModelParameters,
-    NonNegative,
-    Positive,
-    Share,
-)
+from learning.configuration import ALL, Count, ModelParameters, Share
 from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
 from learning.plant_data import PlantData
 from learning.prediction_errors import SortedErrors, expected_penalties

@@ -11,10 +11,10 @@ from scipy.linalg import expm
 
 from controllers.theta import Parameters
 from cosim.core.protocols import Vector
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import Positive, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State
-from learning.configuration import Configuration, Count, GreedyConfiguration, Positive
+from learning.configuration import Configuration, Count, GreedyConfiguration
 from learning.step import HESSIAN_BLOCKS, update_without_fit
 
 

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from controllers.theta import Parameters
 from cosim.core.protocols import Matrix, Vector
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import NonNegative, Positive, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import (
@@ -25,8 +25,6 @@ from learning.configuration import (
     ExplorationDecay,
     ExplorationProbability,
     ExplorationShare,
-    NonNegative,
-    Positive,
 )
 from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel, PredictionErrors

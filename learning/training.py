@@ -29,7 +29,14 @@ from cosim.core.result import Result
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import functions_of, reporting, simulate
 from cosim.core.statistics import Estimate, shown
-from cosim.core.training_options import HELD_OUT, TrainingOptions, with_training_options
+from cosim.core.training_options import (
+    CHECKPOINT,
+    HELD_OUT,
+    LOG,
+    PARAMETERS,
+    TrainingOptions,
+    with_training_options,
+)
 from cosim.plant import FmuPlant
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
@@ -45,10 +52,7 @@ from learning.verdict import WORSE, Verdict, verdict
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CHECKPOINT = "checkpoint.npz"
 FIGURE = "learning.png"
-LOG = "learning.csv"
-PARAMETERS = "parameters.toml"
 TRAINING_FILES = (
     CHECKPOINT, LOG, PARAMETERS, FIGURE, "learning.gif", "summary.json", "scenario.toml",
     "training.rrd",

@@ -19,7 +19,16 @@ from controllers.theta import Parameters, ThetaBlocks
 from cosim.core.protocols import Vector
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import spawn_seeds
-from cosim.core.training_options import HELD_OUT, MOST, Range, TrainingOptions, option_ranges
+from cosim.core.training_options import (
+    DEFAULT_SAMPLES,
+    EVALUATE_EVERY,
+    HELD_OUT,
+    LOG_EVERY,
+    MOST,
+    Range,
+    TrainingOptions,
+    option_ranges,
+)
 from cosim.core.validation import suggestion
 from cosim.identity import depends_on
 from cosim.plant import FmuPlant
@@ -31,16 +40,10 @@ from learning.exploration import Strategy
 from learning.loop import TrainingLoop
 from learning.retreat import Retreat
 
-DEFAULT_SAMPLES = 50_000
-"""Length of a run where neither user nor algorithm states one."""
 STARTS = ("naive", "tuned", "backed-off", "cautious")
 CARRIERS = ("rti", "converged")
 """Controllers that can carry θ."""
-LOG_EVERY = 1000
-"""Samples per row of the log, where nothing else is asked for."""
-EVALUATE_EVERY = 5000
-"""Samples per greedy evaluation and per checkpoint, about, likewise."""
-KINDS: dict[str, type] = {"int": Integral, "float": Real, "str": str}
+OPTION_KINDS: dict[str, type] = {"int": Integral, "float": Real, "str": str}
 """Types that stand for a field's, NumPy's numbers among them."""
 WORDS = {"int": "a whole number", "float": "a number", "str": "a text"}
 """The same in messages."""
@@ -179,7 +182,7 @@ def _check_options(options: TrainingOptions) -> None:
         if value is None and alternative == "None":
             continue
         # Python's bool is an integer, a TOML file's is not.
-        if isinstance(value, bool) or not isinstance(value, KINDS[kind]):
+        if isinstance(value, bool) or not isinstance(value, OPTION_KINDS[kind]):
             raise ConfigurationError(
                 f"training: {option.name} must be {WORDS[kind]}, not {value!r:.60}"
             )

@@ -59,8 +59,9 @@ def train(
     with cli.output(json) as out_:
         from controllers.optimum import stored_optimum
         from cosim.core.files import staged
+        from cosim.core.training_options import CHECKPOINT
         from learning.algorithm import load_algorithm
-        from learning.training import CHECKPOINT, TRAINING_FILES, run_training
+        from learning.training import TRAINING_FILES, run_training
         from learning.training_run import make_run
         from learning.verdict import WORSE
 

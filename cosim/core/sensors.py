@@ -12,7 +12,7 @@ from cosim.core.errors import PlantError
 from cosim.core.protocols import Array
 from cosim.core.scenario import SensorTable
 
-BLOCK = 256
+DRAWS_AT_ONCE = 256
 """Draws of a sensor that are made at once."""
 _SEED = struct.Struct("<Q")
 STREAM = 0x53454E53
@@ -78,16 +78,16 @@ class Sensors:
 
     def _noise(self, i: int, k: int) -> float:
         """The standard normal draw of sensor i at sample k."""
-        block = k // BLOCK
+        block = k // DRAWS_AT_ONCE
         number, draws = self._blocks.get(i, (-1, np.empty(0)))
         if number != block:
             # As integers of 64 bits: in a list NumPy would round a large seed.
             key = np.array([self._seed, STREAM], dtype=np.uint64)
             counter = np.array([0, 0, block, i], dtype=np.uint64)
             generator = np.random.Philox(key=key, counter=counter)
-            draws = np.random.Generator(generator).standard_normal(BLOCK)
+            draws = np.random.Generator(generator).standard_normal(DRAWS_AT_ONCE)
             self._blocks[i] = block, draws
-        return float(draws[k % BLOCK])
+        return float(draws[k % DRAWS_AT_ONCE])
 
     def state(self) -> tuple[int, Array]:
         """What `restore` needs to go on from here: the seed, and a copy of the last values."""

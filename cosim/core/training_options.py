@@ -10,6 +10,16 @@ from dataclasses import dataclass, field, fields
 from inspect import Parameter, signature
 from typing import Any, TypeVar, get_type_hints
 
+CHECKPOINT = "checkpoint.npz"
+LOG = "learning.csv"
+PARAMETERS = "parameters.toml"
+"""Files of a training: its checkpoint, its log, its θ."""
+DEFAULT_SAMPLES = 50_000
+"""Length of a run where neither user nor algorithm states one."""
+LOG_EVERY = 1000
+"""Samples per row of the log, where nothing else is asked for."""
+EVALUATE_EVERY = 5000
+"""Samples per greedy evaluation and per checkpoint, about, likewise."""
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 MOST = 100_000_000

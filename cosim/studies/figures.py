@@ -20,6 +20,7 @@ from cosim.core.errors import StudyError
 from cosim.core.protocols import Array
 from cosim.core.scenario import VIOLATING, Scenario
 from cosim.core.statistics import regrets, td_error_mean
+from cosim.core.training_options import LOG, PARAMETERS
 from cosim.core.trajectory import Trajectory, read_csv
 from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, DotRow, EndLabel, LineStyle, palette, shown_case
@@ -29,7 +30,7 @@ from cosim.measurement import built
 from cosim.studies.operation import OperationLayout, OperationResult
 from cosim.studies.plan import StudyPlan
 from cosim.studies.report import FOLDER
-from cosim.studies.run import LOG, PARAMETERS, Run, folder_name, read_table
+from cosim.studies.run import Run, folder_name, read_table
 
 BANDED = 6
 """Largest number of curves with bands in a panel: more cannot be told apart."""

@@ -16,22 +16,14 @@ from cosim.core.errors import StudyError
 from cosim.core.modules import import_from
 from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario, resolved
-from cosim.core.training_options import HELD_OUT, OPTION_NAMES, TrainingOptions
+from cosim.core.training_options import HELD_OUT, LOG, OPTION_NAMES, PARAMETERS, TrainingOptions
 from cosim.core.validation import instead, validated
 from cosim.evaluation import EVALUATION
 from cosim.identity import code_hash, versions
 from cosim.measurement import Noise
 from cosim.plant import FmuPlant
 from cosim.studies.document import DEFAULT, CaseTable, StudyTable, TrajectoryTable, read
-from cosim.studies.run import (
-    GREEDY,
-    LOG,
-    PARAMETERS,
-    Run,
-    TrainingJob,
-    folder_name,
-    functions_for,
-)
+from cosim.studies.run import GREEDY, Run, TrainingJob, folder_name, functions_for
 from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError

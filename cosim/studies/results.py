@@ -23,6 +23,7 @@ from cosim.core.protocols import Array
 from cosim.core.result import Shown, TextTable, markdown_table
 from cosim.core.simulation import reporting
 from cosim.core.statistics import Estimate, over_runs, paired_difference, shown, two_way
+from cosim.core.training_options import LOG
 from cosim.core.validation import instead
 from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.figures.style import FORMATS, DotRow, LineStyle, palette, save_set
@@ -33,7 +34,6 @@ from cosim.studies.report import NEAR, PAPER, REPORT_COLUMNS, SHORT_COLUMNS
 from cosim.studies.run import (
     GREEDY,
     INDICATORS,
-    LOG,
     Runner,
     RunStore,
     folder_name,

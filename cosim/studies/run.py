@@ -26,7 +26,7 @@ from cosim.core.files import read_json, temporary_folder, write_atomically
 from cosim.core.modules import UNKNOWN
 from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario
-from cosim.core.training_options import TrainingOptions
+from cosim.core.training_options import CHECKPOINT, LOG, PARAMETERS, TrainingOptions
 from cosim.evaluation import EVALUATION, TIMING, Progress
 from cosim.identity import changed, file_hash
 from cosim.measurement import Factory, Measured, MeasureItem, Noise
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
 
 RUNS_FOLDER = "runs"
 RUN_FILE = "run.json"
-CHECKPOINT = "checkpoint.npz"
-LOG = "learning.csv"
-PARAMETERS = "parameters.toml"
 TRAINED = (LOG, PARAMETERS)
 """Files of a finished training."""
 GREEDY = "greedy.csv"

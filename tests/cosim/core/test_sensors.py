@@ -9,7 +9,7 @@ from cosim import FmuPlant, Scenario, simulate
 from cosim.core.errors import CosimError, PlantError, ScenarioError
 from cosim.core.plugins import build_controller
 from cosim.core.scenario import SensorTable
-from cosim.core.sensors import BLOCK, Sensors
+from cosim.core.sensors import DRAWS_AT_ONCE, Sensors
 
 SEED = 2**64 - 1
 
@@ -41,7 +41,7 @@ def test_a_reading_is_the_value_at_its_sample_and_arrives_late(every, delay):
 
 
 def test_the_noise_is_standard_normal_white_and_of_one_sensor_alone():
-    count = 40 * BLOCK
+    count = 40 * DRAWS_AT_ONCE
     tables = [{"variable": name, "deviation": 2.0} for name in ("a", "b")]
     noise = readings(tables, np.zeros((count, 2))) / 2.0
     # Three standard errors of each estimate.

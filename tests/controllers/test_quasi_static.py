@@ -25,7 +25,10 @@ def test_the_law_of_fouling_is_the_fmus(drifting):
     seen = drifting.replace(
         {
             "sampling_time": 21600.0,
-            "plant": {"disturbances": ["UA2_present"], "mapping": {"nominal": [], "ranges": []}},
+            "plant": {
+                "disturbances": ["UA2_present"],
+                "mapping": {"nominal": [], "ranges": [], "time_constant": []},
+            },
             "disturbance": {"law": "none", "nominal": [], "ranges": []},
         }
     )

@@ -174,7 +174,9 @@ class TrainingLoop:
             update = self.algorithm.failed(cost)
         if update is not None and update.lost and self._retreat is not None:
             self._go_back(self._retreat.best_theta)
-        update = self._compared(cost) or update
+        # J is of the truth; what is compared is what can be known of it.
+        known_cost = cost if transition is None else transition.cost
+        update = self._compared(known_cost) or update
         if update is None:
             return cost, None
         self.counts.failures += update.failures

@@ -1,6 +1,8 @@
-"""Stored builds of the presets' controllers: `python -m benchmarks.builds` makes them anew.
+"""Stored builds of the presets' controllers: `python -m benchmarks.builds` makes what is missing.
 
-It takes the extra `cross`; five platforms take some minutes.
+A build's name has the hash of its sources: what is stored under it is kept. To make all of them
+anew, for another compiler say, delete `controllers/builds.tar.xz` first. It takes the extra
+`cross`; all libraries of five platforms take some minutes.
 """
 
 from __future__ import annotations
@@ -65,16 +67,32 @@ def built(sources: Mapping[str, bytes], platform: Platform) -> bytes:
     return cross_compiler(platform).library(sources, "library", options)
 
 
+def stored_builds() -> dict[str, bytes]:
+    """The libraries of `BUILDS` by name; none where there is no such file."""
+    if not BUILDS.is_file():
+        return {}
+    builds = {}
+    with tarfile.open(BUILDS) as archive:
+        for name in archive.getnames():
+            member = archive.extractfile(name)
+            assert member is not None
+            builds[name] = member.read()
+    return builds
+
+
 def main() -> None:
-    """Build all and write `BUILDS`."""
-    wanted = {
-        build_name(sources, SYSTEMS[platform.tuple]): (sources, platform)
-        for sources in preset_sources()
-        for platform in PLATFORMS
-    }
+    """Build what is missing, and write `BUILDS`."""
+    wanted: dict[str, tuple[dict[str, bytes], Platform]] = {}
+    for sources in preset_sources():
+        for platform in PLATFORMS:
+            wanted[build_name(sources, SYSTEMS[platform.tuple])] = sources, platform
+    stored = stored_builds()
+    missing = [name for name in wanted if name not in stored]
+    print(f"{len(wanted)} libraries, {len(missing)} of them to build", flush=True)
     with ThreadPoolExecutor(2) as pool:
-        each = pool.map(lambda pair: built(*pair), wanted.values())
-        builds = dict(zip(wanted, each, strict=True))
+        made = pool.map(lambda name: built(*wanted[name]), missing)
+        stored |= dict(zip(missing, made, strict=True))
+    builds = {name: stored[name] for name in wanted}
     with replacing(BUILDS) as partial, tarfile.open(partial, "w:xz", preset=9) as archive:
         for name, data in builds.items():
             entry = tarfile.TarInfo(name)

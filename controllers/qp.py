@@ -539,7 +539,11 @@ SOLVER_ATTEMPTS: dict[str, list[dict[str, Any]]] = {
         PROXQP_TOLERANCES,
         PROXQP_TOLERANCES | {"primal_infeasibility_solving": True},
     ],
-    "clarabel": [CLARABEL_TOLERANCES],
+    "clarabel": [
+        CLARABEL_TOLERANCES,
+        # Where polishing finds no vertex from there: as near as it comes.
+        {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-12, "tol_feas": 1e-11},
+    ],
     "daqp": [DAQP_SETTINGS],
 }
 

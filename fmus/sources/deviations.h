@@ -86,10 +86,12 @@ static void realise_disturbances(State *state) {
 
 /* Whether the filters can be brought to this sample: forwards, and soon. */
 static int within_reach(const State *state, int64_t sample) {
-    const int64_t passed = sample - state->model.filtered;
+    const int64_t filtered = state->model.filtered;
     if (!state->model.begun || !is_coloured(state->v)) return 1;
     /* One back: a clock that is behind by rounding. */
-    return passed >= -1 && passed <= MAX_SAMPLES_PER_EVENT;
+    if (sample < filtered) return sample == filtered - 1;
+    /* Unsigned: the difference of two numbers of 64 bits may be none with a sign. */
+    return (uint64_t)sample - (uint64_t)filtered <= (uint64_t)MAX_SAMPLES_PER_EVENT;
 }
 
 /* Whether each deviation is one that the filters can have: with |w| < 9 (sqrt(106 ln 2) is the largest

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 SCRIPT = Path(__file__).parents[1] / "helpers" / "no_network.py"
 COMMANDS = {
     "simulate": ["simulate", "-n", "50", "--record", "--out", "run"],
-    "train": ["train", "-a", "q-learning", "-n", "500", "--evaluate-every", "1000", "--out", "t"],
+    "train": ["train", "-a", "fixed", "-n", "500", "--evaluate-every", "1000", "--out", "t"],
     "view": ["view", "run/run.rrd", "--png", "run.png"],
 }
 

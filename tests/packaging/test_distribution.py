@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 PRESETS = {"paper", "nominal", "fast-sampling", "fouled", "mismatched", "drifting", "jump"}
 PRESETS |= {"reactor", "tanks", "holdup", "slow-sampling", "dead-time", "unstable-reactor"}
-PRESETS |= {"coloured-2", "coloured-5", "coloured-10"}
+PRESETS |= {"coloured-2", "coloured-5", "coloured-10", "assay", "assay-fouled", "late", "levels"}
 
 
 # Other people's tools may warn; what is installed may not.

@@ -22,7 +22,8 @@ def _as_option(name: str, kind: Any) -> Any:
     limits = option_ranges().get(name)
     least = None if limits is None else limits.least
     most = None if limits is None else limits.most
-    text = cli.descriptions(TrainingOptions, "Attributes")[name]
+    # None where Python drops docstrings (`python -OO`).
+    text = cli.descriptions(TrainingOptions, "Attributes").get(name)
     return Annotated[kind, typer.Option(min=least, max=most, help=text)]
 
 

@@ -266,15 +266,20 @@ class ExtendedKalmanFilter:
         step.inputs["z"][:] = self._reference
         step.inputs["u"][:] = problem.reference_action
         step()
-        A = step.matrix("A").T[:n, :n]
-        C = self._output.matrix("C").T[:, :n]
-        values, vectors = np.linalg.eig(A)
+        # In the widths of the bounds, so that no unit decides.
+        widths = _widths(problem)
+        A = step.matrix("A").T[:n, :n] * widths / widths[:, None]
+        C = self._output.matrix("C").T[:, :n] * widths
+        C = C / np.abs(C).max(axis=1, keepdims=True)
         names = [quantity.name for quantity in problem.model.states]
-        for value, direction in zip(values, vectors.T, strict=True):
-            # Popov, Belevitch and Hautus: a mode is observed where C v is not zero.
-            seen = np.abs(C @ direction).max() > UNSEEN * np.abs(C).max()
-            if seen or abs(value) < 1.0:
+        for value in np.linalg.eigvals(A):
+            if abs(value) < 1.0:
                 continue
+            # Popov, Belevitch and Hautus: a direction v with A v = λ v and C v = 0 is not seen.
+            _, sizes, rows = np.linalg.svd(np.vstack([A - value * np.eye(n), C]))
+            if sizes[-1] > UNSEEN * sizes[0]:
+                continue
+            direction = rows[-1].conj() * widths
             largest = int(np.argmax(np.abs(direction)))
             parts = []
             for name, part in zip(names, (direction / direction[largest]).real, strict=True):

@@ -146,6 +146,12 @@ def test_a_growing_direction_that_no_sensor_shows_is_refused():
     growing = linear_model(rates=np.array([[-0.02, 0.0], [0.0, 0.03]]))
     with pytest.raises(ControllerError, match="direction \\+1 b"):
         ExtendedKalmanFilter(linear_problem(growing), [SensorTable(variable="a")])
+    # Of two integrators their sum shows each, and not their difference.
+    integrators = linear_model(
+        rates=np.zeros((2, 2)), outputs={"y": lambda x, u, d, p: x[0] + x[1]}
+    )
+    with pytest.raises(ControllerError, match=r"direction [+-]1 a [+-]1 b"):
+        ExtendedKalmanFilter(linear_problem(integrators), [SensorTable(variable="y")])
     # One that decays by itself may stay unseen.
     decaying = linear_model(rates=np.array([[-0.02, 0.0], [0.0, -0.03]]))
     ExtendedKalmanFilter(linear_problem(decaying), [SensorTable(variable="a")])

@@ -323,7 +323,7 @@ class OutputFeedback:
         Raises:
             ControllerError: The scenario wants no estimator, or its factory makes none.
         """
-        kind = scenario.estimator.kind if scenario.estimator is not None else "ekf"
+        kind = (scenario.estimator or EstimatorTable()).kind
         if kind == "ekf":
             return cls(ExtendedKalmanFilter.from_scenario(scenario), controller)
         if kind == "none":

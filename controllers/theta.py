@@ -18,6 +18,7 @@ from pydantic import Field
 
 from controllers.errors import ModelError, ParameterError
 from controllers.functions import consecutive
+from controllers.model import Model
 from controllers.problem import Problem
 from cosim.core.files import parse_toml, read_text, write_atomically
 from cosim.core.protocols import Vector
@@ -330,6 +331,13 @@ class Parameters(Shown):
     def with_theta(self, theta: ArrayLike) -> Parameters:
         """Copy with another flat vector."""
         return Parameters(self.blocks, np.asarray(theta, dtype=np.float64))
+
+    def of_model(self, model: Model) -> Vector:
+        """All parameters of a model at θ, (n_p,): the nominal ones but for θ's block p."""
+        values = model.nominal_parameters
+        if "p" in self.blocks:
+            values[model.parameter_indices(self.blocks.block("p").labels)] = self["p"]
+        return values
 
     def require_well_posed(self) -> None:
         """Raise ParameterError on an x_l not below its x_u or a slack weight not positive."""

@@ -311,12 +311,8 @@ class NominalModel:
     def __init__(self, scenario: Scenario, start: Parameters) -> None:
         problem = Problem.from_scenario(scenario)
         model = problem.model
-        parameters = model.nominal_parameters
-        if "p" in start.blocks:
-            labels = start.blocks.block("p").labels
-            parameters[model.parameter_indices(labels)] = start["p"]
         d = ca.DM(model.nominal_disturbance)
-        p = ca.DM(parameters)
+        p = ca.DM(start.of_model(model))
         x = ca.SX.sym("x", problem.n_states)
         u = ca.SX.sym("u", problem.n_actions)
         following = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from controllers.estimator import measured, measured_outputs
+from controllers.estimator import EXPECTED_DISTURBANCE, measured, measured_outputs
 from controllers.factories import nmpc, tuned
 from controllers.functions import StackedFunction
 from controllers.model import discretise
@@ -44,7 +44,7 @@ def cautious(scenario: Scenario) -> RtiNmpc:
 def back_off(
     start: Parameters,
     scenario: Scenario,
-    deviation: float = 0.1,
+    deviation: float = EXPECTED_DISTURBANCE,
     samples: int = 8000,
 ) -> Parameters:
     """Back-offs of least cost in a simulation of the controller's own model.
@@ -83,7 +83,7 @@ def back_off(
 def add_reserve(
     start: Parameters,
     scenario: Scenario,
-    deviation: float = 0.1,
+    deviation: float = EXPECTED_DISTURBANCE,
     reserve: float = 18.0,
     samples: int = 1000,
 ) -> Parameters:

@@ -46,15 +46,17 @@ class Evaluator:
         self._run = run
         self._plant = plant
         self._controller = nmpc(run.scenario, start, run.controller)
+        self._law = measured(run.scenario, self._controller)
         naive = Parameters.naive(Problem.from_scenario(run.scenario))
-        naive_costs = self._costs(nmpc(run.scenario, naive, run.controller))["J"]
+        naive_law = measured(run.scenario, nmpc(run.scenario, naive, run.controller))
+        naive_costs = self._costs(naive_law)["J"]
         self.baselines = {"naive": float(naive_costs.mean())}
         self._optimal_costs = np.full(run.evaluation_seeds, np.nan)
         if optimum is not None:
             self._optimal_costs = self._costs(optimum)["J"]
             self.baselines["optimal"] = float(self._optimal_costs.mean())
         # All that a training is compared with meets the same noise.
-        start_costs = self._costs(self._controller)
+        start_costs = self._costs(self._law)
         self._start_costs = start_costs["J"]
         self.start = self._metrics(start_costs)
         self._theta = start.theta
@@ -75,7 +77,7 @@ class Evaluator:
         # A training ends with the θ of its last row, and a rule may leave θ as it is.
         if not np.array_equal(theta, self._theta):
             self._controller.theta = theta
-            self._evaluation = self._metrics(self._costs(self._controller))
+            self._evaluation = self._metrics(self._costs(self._law))
             self._theta = theta.copy()
         return self._evaluation
 
@@ -100,5 +102,4 @@ class Evaluator:
         seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
         # All runs together say whether compiling pays.
         compile_functions(policy, self._run.evaluation_steps * len(seeds))
-        policy = measured(self._run.scenario, policy)
         return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)

@@ -63,11 +63,7 @@ class OneStepModel:
 
     def parameters(self, theta: Parameters) -> Vector:
         """All parameters of the model at θ, (n_p,): the nominal ones but for its block p."""
-        values = self._model.nominal_parameters
-        if "p" in theta.blocks:
-            labels = theta.blocks.block("p").labels
-            values[self._model.parameter_indices(labels)] = theta["p"]
-        return values
+        return theta.of_model(self._model)
 
     def predict(
         self,

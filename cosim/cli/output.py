@@ -18,9 +18,7 @@ import typer
 from cosim.core.errors import CosimError
 from cosim.core.files import write_atomically
 from cosim.core.processes import Terminated, hold, redirected_output, release
-
-MOST = 100_000_000
-"""Samples of the longest run."""
+from cosim.core.training_options import MOST
 
 
 def count(*names: str, text: str | None = None) -> Any:

@@ -64,26 +64,21 @@ def _worst(scenario: Scenario, theta: Parameters, hessian: str, samples: int, fo
     return worst
 
 
-@pytest.mark.parametrize(
-    ("scenario", "theta", "hessian"),
-    [("paper", "tuned", "gauss-newton"), ("fast-sampling", "learnt", "exact")],
-)
+CASES = [
+    ("paper", "tuned", "gauss-newton", 300),
+    ("fast-sampling", "learnt", "exact", 300),
+]
+for _scenario in ("paper", "fast-sampling", "fouled"):
+    for _theta, _hessian in (("tuned", "gauss-newton"), ("learnt", "exact")):
+        CASES.append(pytest.param(_scenario, _theta, _hessian, 2000, marks=pytest.mark.slow))
+
+
+@pytest.mark.parametrize(("scenario", "theta", "hessian", "samples"), CASES)
 def test_it_gives_the_actions_of_the_python_controller(
-    tmp_path: Path, scenario: str, theta: str, hessian: str
+    tmp_path: Path, scenario: str, theta: str, hessian: str, samples: int
 ) -> None:
     loaded = Scenario.load(scenario)
-    worst = _worst(loaded, THETAS[theta](loaded), hessian, 300, tmp_path)
-    assert worst[1:].max() < 1e-6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("theta", "hessian"), [("tuned", "gauss-newton"), ("learnt", "exact")])
-@pytest.mark.parametrize("scenario", ["paper", "fast-sampling", "fouled"])
-def test_two_thousand_samples_agree(
-    tmp_path: Path, scenario: str, theta: str, hessian: str
-) -> None:
-    loaded = Scenario.load(scenario)
-    worst = _worst(loaded, THETAS[theta](loaded), hessian, 2000, tmp_path)
+    worst = _worst(loaded, THETAS[theta](loaded), hessian, samples, tmp_path)
     assert worst[1:].max() < 1e-6
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError, ModelError
-from controllers.functions import StackedFunction
+from controllers.functions import StackedFunction, define
 from controllers.model import discretise
 from controllers.problem import Problem
 from cosim.core.modules import load_plugin
@@ -458,9 +458,8 @@ def _transition_function(problem: Problem, uncertain: Sequence[int]) -> StackedF
         "derivatives", [z, u, d], [z_next, ca.jacobian(z_next, z), ca.jacobian(z_next, d)]
     )
     value, A, G = derivatives(z, u, ca.SX(ca.DM(model.nominal_disturbance)))
-    return StackedFunction(
-        "estimator_transition", {"z": z, "u": u}, {"z_next": value, "A": A, "G": G}
-    )
+    results = {"z_next": value, "A": A, "G": G}
+    return StackedFunction(define("estimator_transition", {"z": z, "u": u}, results))
 
 
 def measured_outputs(
@@ -493,4 +492,5 @@ def measured_outputs(
                 f"'{model.name}': give it to the model, Model(outputs={{'{variable}': …}})"
             )
     y = ca.vertcat(*rows)
-    return StackedFunction("estimator_output", {"z": z}, {"y": y, "C": ca.jacobian(y, z)})
+    results = {"y": y, "C": ca.jacobian(y, z)}
+    return StackedFunction(define("estimator_output", {"z": z}, results))

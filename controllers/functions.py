@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tarfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,19 +40,60 @@ def consecutive(sizes: Mapping[str, int], first: int = 0) -> dict[str, slice]:
     return slices
 
 
-class StackedFunction:
-    """A CasADi function of expressions whose arguments and results live in fixed NumPy arrays.
+@dataclass(frozen=True)
+class Definition:
+    """A CasADi function whose results are one dense column, and the sizes of its parts.
 
-    `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
-    read the results by `part`, or `matrix`. A call allocates nothing. All results share one flat
-    array, `stack`, so that one copy keeps them all. Inputs that are not shared, and results, are
-    one array, `memory`; `places` are slices of it by name, `slices` the results' in `stack`. The
-    expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
+    Attributes:
+        function: the function; it has no memory of its own and may serve many.
+        inputs: number of entries of each input by name, in order.
+        shapes: rows and columns of each result by name, in order of the column.
+    """
+
+    function: ca.Function
+    inputs: Mapping[str, int]
+    shapes: Mapping[str, tuple[int, int]]
+
+
+def define(
+    name: str,
+    arguments: Mapping[str, Expression],
+    results: Mapping[str, Expression],
+) -> Definition:
+    """Make a function of expressions for `StackedFunction`.
+
+    The expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
 
     Args:
         name: Name of the function, in C too.
         arguments: Symbols by the names of the inputs.
         results: Expressions by name.
+    """
+    # Dense, so that every result has a fixed place; common subexpressions are computed once.
+    stacked = ca.veccat(*results.values())
+    function = ca.Function(
+        name,
+        [ca.densify(argument) for argument in arguments.values()],
+        [ca.densify(stacked)],
+        list(arguments),
+        ["stack"],
+        {"cse": True},
+    )
+    inputs = {key: argument.numel() for key, argument in arguments.items()}
+    shapes = {key: result.shape for key, result in results.items()}
+    return Definition(function, inputs, shapes)
+
+
+class StackedFunction:
+    """A CasADi function whose arguments and results live in fixed NumPy arrays.
+
+    `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
+    read the results by `part`, or `matrix`. A call allocates nothing. All results share one flat
+    array, `stack`, so that one copy keeps them all. Inputs that are not shared, and results, are
+    one array, `memory`; `places` are slices of it by name, `slices` the results' in `stack`.
+
+    Args:
+        definition: The function with the sizes of its parts.
         shared: Arrays of inputs that are read from other memory, such as another function's output.
         room: Sizes, by name, of more parts that `memory` has behind the function's own.
         memory: The memory to use in place of a new one.
@@ -59,33 +101,23 @@ class StackedFunction:
 
     def __init__(
         self,
-        name: str,
-        arguments: Mapping[str, Expression],
-        results: Mapping[str, Expression],
+        definition: Definition,
         shared: Mapping[str, Vector] | None = None,
         *,
         room: Mapping[str, int] | None = None,
         memory: Vector | None = None,
     ) -> None:
-        # Dense, so that every result has a fixed place; common subexpressions are computed once.
-        stacked = ca.veccat(*results.values())
-        self.function = ca.Function(
-            name,
-            [ca.densify(argument) for argument in arguments.values()],
-            [ca.densify(stacked)],
-            list(arguments),
-            ["stack"],
-            {"cse": True},
-        )
+        self.function = definition.function
+        self.shapes = definition.shapes
 
         # The memory: inputs of its own, the results one after the other, room for the caller.
         shared = shared or {}
         sizes = {}
-        for input_name, argument in arguments.items():
+        for input_name, size in definition.inputs.items():
             if input_name in shared:
-                _check_array(input_name, shared[input_name], argument.numel())
+                _check_array(input_name, shared[input_name], size)
             else:
-                sizes[input_name] = argument.numel()
+                sizes[input_name] = size
         sizes["stack"] = self.function.numel_out(0)
         sizes |= dict(room or {})
         total = sum(sizes.values())
@@ -96,11 +128,10 @@ class StackedFunction:
 
         # Names of its parts; a result has a place in the memory and one in the stack.
         self.places = consecutive(sizes)
-        result_sizes = {key: result.numel() for key, result in results.items()}
+        result_sizes = {key: rows * columns for key, (rows, columns) in self.shapes.items()}
         self.slices = consecutive(result_sizes)
-        self.shapes = {key: result.shape for key, result in results.items()}
         self.inputs: dict[str, Vector] = {}
-        for input_name in arguments:
+        for input_name in definition.inputs:
             if input_name in shared:
                 self.inputs[input_name] = shared[input_name]
             else:

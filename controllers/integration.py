@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from controllers.errors import ModelError, ModelWarning, warn
 from controllers.problem import Problem
 from controllers.qp import Mask
+from controllers.reuse import built_once
 from cosim.core.protocols import Matrix
 
 INTEGRATION_TOLERANCE = 0.01
@@ -139,6 +140,7 @@ class _Predictor:
         return state
 
 
+@built_once
 def measure_integration(problem: Problem) -> Integration:
     """Compare a sample's prediction with those of twice, four times … as many substeps.
 

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
-from controllers.functions import StackedFunction
+from controllers.functions import Definition, StackedFunction, define
 from controllers.integration import check_integration
 from controllers.model import runge_kutta
 from controllers.problem import Problem
 from controllers.qp import LEAST_SIZE, SoftQp
+from controllers.reuse import built_once
 from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
 from cosim.core.protocols import Vector
 from cosim.core.validation import instead
@@ -96,6 +97,7 @@ def sampled_jacobian(
     return x_next, jacobian
 
 
+@built_once
 def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     """One stage's A_k, B_k and r_k of ξ₊ = A_k ξ + B_k v + r_k (paper.tex eq. param_nlp_qp).
 
@@ -229,7 +231,8 @@ def _curvature(
     return hessian
 
 
-def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
+@built_once
+def preparation_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     """Linearise and condense: all of the QP that does not depend on the state s.
 
     All of the QP is in units of `Problem.scale`: states ξ, actions v and costs.
@@ -247,9 +250,6 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     Returns:
         Function of x (n, N) and u (m, N), the linearisation points; L (n+m, N(n+m)), q (n+m, N),
         L_N (n, n), q_N (n); theta. Its results are A, B, r by stage; H, Γ by rows; Φ, g, f, F.
-        Behind them its memory has room for the rest of the QP: the costates (N, n) of the
-        linearisation point, the discounted slack weights w and W (Nn,), and the constant of the
-        stage costs.
     """
     n = problem.n_states
     m = problem.n_actions
@@ -320,13 +320,29 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
         "f": ca.vertcat(*f),
         "F": ca.vertcat(*F).T,
     }
+    return define("preparation", arguments, results)
+
+
+def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
+    """`preparation_definition` with a memory.
+
+    Args:
+        problem: The problem with its model and scale.
+        blocks: The blocks of θ.
+
+    Returns:
+        The function. Behind its results its memory has room for the rest of the QP: the costates
+        (N, n) of the linearisation point, the discounted slack weights w and W (Nn,), and the
+        constant of the stage costs.
+    """
+    entries = problem.horizon * problem.n_states
     room = {
-        "costates": horizon * n,
-        "w": horizon * n,
-        "W": horizon * n,
+        "costates": entries,
+        "w": entries,
+        "W": entries,
         "constant": 1,
     }
-    return StackedFunction("preparation", arguments, results, room=room)
+    return StackedFunction(preparation_definition(problem, blocks), room=room)
 
 
 def _respond(n: int, m: int, horizon: int) -> ca.Function:
@@ -427,24 +443,18 @@ def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     return np.asarray(np.where(j <= k, position, -1))
 
 
-def embedding(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    prepared: StackedFunction,
-    read: StackedFunction,
-) -> StackedFunction:
+@built_once
+def embedding_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     """Initial value embedding: the vectors of the QP that depend on the state s.
 
     Args:
         problem: The problem with its scale.
         blocks: The blocks of θ.
-        prepared: `preparation`'s function, whose memory holds theta, Φ, g, f and F.
-        read: `readout`'s function, in whose memory are the state s and room for the results.
 
     Returns:
-        Function that writes to the read-out's memory the gradient f (Nm,), and the lower and upper
-        limits (Nn,) that the soft rows Γ V must respect. s and theta are in the model's units, the
-        QP in `Problem.scale`'s.
+        Function of s (n) and theta in the model's units, and of `preparation`'s Φ, g, f and F. Its
+        results are the gradient f (Nm,) and the lower and upper limits (Nn,) that the soft rows Γ V
+        must respect, in `Problem.scale`'s units.
     """
     n = problem.n_states
     m = problem.n_actions
@@ -473,17 +483,35 @@ def embedding(
         "upper": ca.repmat(upper, horizon, 1) - free,
     }
 
+    arguments = {"s": s, "theta": symbols["theta"], **condensed}
+    return define("embedding", arguments, results)
+
+
+def embedding(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    prepared: StackedFunction,
+    read: StackedFunction,
+) -> StackedFunction:
+    """`embedding_definition` in the memory of the two other functions.
+
+    Args:
+        problem: The problem with its scale.
+        blocks: The blocks of θ.
+        prepared: `preparation`'s function, whose memory holds theta, Φ, g, f and F.
+        read: `readout`'s function, in whose memory are the state s and room for the results.
+
+    Returns:
+        The function, which writes to the read-out's memory.
+    """
     # The three functions work in one memory: nothing is copied between them.
-    shared = {name: prepared.part(name) for name in condensed}
+    shared = {name: prepared.part(name) for name in ("Phi", "g", "f", "F")}
     shared["theta"] = prepared.inputs["theta"]
     shared["s"] = read.inputs["s"]
     first = read.places["f"].start
     last = read.places["row_upper"].stop
-    arguments = {"s": s, "theta": symbols["theta"], **condensed}
     return StackedFunction(
-        "embedding",
-        arguments,
-        results,
+        embedding_definition(problem, blocks),
         shared,
         memory=read.memory[first:last],
     )
@@ -532,11 +560,8 @@ def _stages(inputs: Mapping[str, ca.SX]) -> list[_Stage]:
     return [_Stage(*stage) for stage in zip(*parts, strict=True)]
 
 
-def readout(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    prepared: StackedFunction,
-) -> StackedFunction:
+@built_once
+def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     """States, slack, costates, value and residual that belong to a solution of the condensed QP.
 
     The QP and its solution are in units of `Problem.scale`, the results in the model's. The
@@ -546,16 +571,13 @@ def readout(
     Args:
         problem: The problem with its model and scale.
         blocks: The blocks of θ.
-        prepared: `preparation`'s function: theta and the QP's A, B, r, L, q, L_N, q_N are read from
-            its memory.
 
     Returns:
         Function of s (n); the primal-dual solution v (m, N), lam (n, N), nu (m, N) with the limits
-        `lower` and `upper` (m, N) of v; the constant of the QP's stage costs. Its results are
-        xi (n, N+1), t (n, N), chi (n, N+1), value; `residual`, see `_residual`; next_x (n, N),
-        next_u (m, N) in absolute units, next_chi (n, N), the costates of stages that weigh 1/γ as
-        much. Behind them its memory has room for the rest of a solution: what `embedding` gives,
-        and what compiled code gives, `iterations` of the QP's solver and the gradient (n_θ,).
+        `lower` and `upper` (m, N) of v; the QP's A, B, r, L, q, L_N, q_N, the constant of its stage
+        costs, and theta. Its results are xi (n, N+1), t (n, N), chi (n, N+1), value; `residual`,
+        see `_residual`; next_x (n, N), next_u (m, N) in absolute units, next_chi (n, N), the
+        costates of stages that weigh 1/γ as much.
     """
     n = problem.n_states
     m = problem.n_actions
@@ -622,17 +644,35 @@ def readout(
         **_shifted(problem, states, actions, costates),
         "residual": _residual(stages, L_N, xi, chi, bounds, discounts),
     }
+    return define("readout", {**inputs, "theta": symbols["theta"]}, results)
+
+
+def readout(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    prepared: StackedFunction,
+) -> StackedFunction:
+    """`readout_definition` with a memory for a sample's solution.
+
+    Args:
+        problem: The problem with its model and scale.
+        blocks: The blocks of θ.
+        prepared: `preparation`'s function: theta and the QP's matrices are read from its memory.
+
+    Returns:
+        The function. Behind its results its memory has room for the rest of a solution: what
+        `embedding` gives, and what compiled code gives, `iterations` of the QP's solver and the
+        gradient (n_θ,).
+    """
+    horizon = problem.horizon
     from_preparation = ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
-    shared = {name: prepared.part(name) for name in from_preparation}
     return StackedFunction(
-        "readout",
-        {**inputs, "theta": symbols["theta"]},
-        results,
-        shared,
+        readout_definition(problem, blocks),
+        {name: prepared.part(name) for name in from_preparation},
         room={
-            "f": horizon * m,
-            "row_lower": horizon * n,
-            "row_upper": horizon * n,
+            "f": horizon * problem.n_actions,
+            "row_lower": horizon * problem.n_states,
+            "row_upper": horizon * problem.n_states,
             "iterations": 1,
             "gradient": blocks.size,
         },
@@ -920,7 +960,7 @@ class Exact(GaussNewton):
         self._ranges = problem.scale.ranges
         # Over the ranges, and relative to the level of the cost, eigenvalues have no unit.
         self.metric = np.outer(self._ranges, self._ranges) / problem.scale.level
-        self._curvature = _curvature_by_stage(problem, blocks)
+        self._curvature = StackedFunction(_curvature_by_stage(problem, blocks))
         self.functions["CURVATURE"] = self._curvature
 
     def set_parameters(self, parameters: Parameters) -> None:
@@ -974,7 +1014,8 @@ class Exact(GaussNewton):
         return np.asarray(lift)
 
 
-def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
+@built_once
+def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> Definition:
     """D_k (n+m, n+m) of all stages from x (n, N), u (m, N), guess (n, N), which is χ̄, and theta."""
     n = problem.n_states
     m = problem.n_actions
@@ -997,7 +1038,7 @@ def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> StackedFunctio
     theta = ca.repmat(arguments["theta"], 1, horizon)
     stages = stage.map(horizon)
     D = stages(arguments["x"], arguments["u"], arguments["guess"], theta)
-    return StackedFunction("curvature", arguments, {"D": D})
+    return define("curvature", arguments, {"D": D})
 
 
 HESSIANS = {"gauss-newton": GaussNewton, "exact": Exact}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import secrets
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import exp, sqrt
 from pathlib import Path
@@ -16,8 +18,9 @@ from numpy.typing import ArrayLike
 
 import fmus
 from controllers.errors import ModelError, OptimumError
+from controllers.functions import not_in_c
 from controllers.memory import Memory, remember
-from controllers.model import Model, discretise
+from controllers.model import KINDS, Model, discretise
 from controllers.qp import DAQP_FIXED, DAQP_SETTINGS, DAQP_STATUS, Mask
 from cosim.core.modules import exception_line, load_plugin
 from cosim.core.protocols import Matrix, Vector
@@ -459,6 +462,29 @@ class Problem:
     def scale(self) -> Scale:
         """What the controller's QP is scaled by."""
         return Scale.from_problem(self)
+
+    @cached_property
+    def content(self) -> str:
+        """Digest of all that functions of this problem are made of: model, bounds, every number.
+
+        Problems with the same content have the same functions. A model that calls what is outside
+        of CasADi's own functions, such as a library in a file, has a content of its own: what it
+        computes cannot be known.
+        """
+        model = self.model
+        symbols = list(model.symbols())
+        expressions = [ca.SX(model.ode(*symbols)), ca.SX(model.economic_cost(*symbols))]
+        function = ca.Function("content", symbols, expressions)
+        if not_in_c([function]) is not None:
+            return secrets.token_hex()
+        numbers = []
+        for item in fields(self):
+            if item.name != "model":
+                value = np.asarray(getattr(self, item.name))
+                numbers.append((item.name, value.tolist()))
+        quantities = [getattr(model, kind) for kind in KINDS]
+        said = repr((model.name, quantities, model.time_unit, model.uncertain, numbers))
+        return hashlib.sha256((said + function.serialize()).encode()).hexdigest()
 
     def value_level(self, discount: float | None = None) -> float:
         """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.

@@ -8,12 +8,12 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, cached_property
 
 import casadi as ca
 import numpy as np
 
-from controllers.functions import StackedFunction
+from controllers.functions import Definition, StackedFunction, define
 from controllers.preparation import (
     matrix_symbols,
     scalar_symbols,
@@ -22,6 +22,7 @@ from controllers.preparation import (
 )
 from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
+from controllers.reuse import built_once
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
 from cosim.core.protocols import Matrix
 
@@ -162,11 +163,12 @@ class _Sensitivities:
         (substituted,) = ca.substitute([expression], unscaled, [v, lam])
         return substituted
 
-    def value_gradient(self) -> StackedFunction:
+    @cached_property
+    def value_gradient(self) -> Definition:
         """dV/dθ or dQ/dθ: the Lagrangian's gradient at a solution."""
         results = {"gradient": self.in_scaled_units(self.gradient)}
         if "p" not in self.blocks:
-            return StackedFunction("value_gradient", self.inputs, results)
+            return define("value_gradient", self.inputs, results)
 
         # A stage's gradient is called: written out for each stage its C takes minutes to compile.
         rest = stage_function("value_gradient_rest", self.inputs, results)
@@ -176,9 +178,10 @@ class _Sensitivities:
         by_stage = stages(*self._stage_arguments(symbols))
         gradient = rest(*symbols.values())
         gradient[self.blocks.slices["p"]] = ca.sum2(by_stage)
-        return StackedFunction("value_gradient", symbols, {"gradient": gradient})
+        return define("value_gradient", symbols, {"gradient": gradient})
 
-    def policy_jacobian(self) -> StackedFunction:
+    @cached_property
+    def policy_jacobian(self) -> Definition:
         """dπ/dθ and dπ/ds, transposed: derivatives of the gradient along the KKT adjoints."""
         problem = self.problem
         n = problem.n_states
@@ -224,7 +227,7 @@ class _Sensitivities:
         inputs = {**self.inputs, **qp, **directions}
         results = {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)}
         if "p" not in self.blocks:
-            return StackedFunction("policy_jacobian", inputs, results)
+            return define("policy_jacobian", inputs, results)
 
         rest = stage_function("policy_jacobian_rest", inputs, {**results, **moved})
         stages = self._moved_parameter_gradient().map(horizon)
@@ -241,7 +244,7 @@ class _Sensitivities:
             by_stage = stages(*arguments, *along)
             jacobian[self.blocks.slices["p"], i] = -ca.sum2(by_stage)
         results_with_p = {"policy": jacobian, "state": parts["state"]}
-        return StackedFunction("policy_jacobian", symbols, results_with_p)
+        return define("policy_jacobian", symbols, results_with_p)
 
     def _stage_arguments(self, symbols: Mapping[str, ca.MX]) -> list[ca.MX]:
         """Arguments of `stage_parameter_gradient`, those of stage 0, 1, … side by side."""
@@ -366,8 +369,18 @@ def sensitivities(
         A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam (nN, m); its
         results are `policy` (n_θ, m), dπ/dθ transposed, and `state` (n, m), dπ/ds transposed.
     """
-    made = _Sensitivities(problem, blocks, exact=exact)
-    return made.value_gradient(), cache(made.policy_jacobian)
+    definitions = _definitions(problem, blocks, exact=exact)
+
+    @cache
+    def policy_jacobian() -> StackedFunction:
+        return StackedFunction(definitions.policy_jacobian)
+
+    return StackedFunction(definitions.value_gradient), policy_jacobian
+
+
+@built_once
+def _definitions(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> _Sensitivities:
+    return _Sensitivities(problem, blocks, exact=exact)
 
 
 def adjoint_directions(

@@ -12,7 +12,7 @@ import numpy as np
 
 from controllers.estimator import EXPECTED_DISTURBANCE, measured, measured_outputs
 from controllers.factories import nmpc, tuned
-from controllers.functions import StackedFunction
+from controllers.functions import StackedFunction, define
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
@@ -152,7 +152,7 @@ class GuessedPlant:
         results = {"y": next_x, "l": ca.SX(model.economic_cost(x, u, d, p))}
         self.scenario = scenario
         self._deviation = deviation
-        self._function = StackedFunction("f", {"x": x, "u": u, "d": d}, results)
+        self._function = StackedFunction(define("f", {"x": x, "u": u, "d": d}, results))
         self._nominal = model.nominal_disturbance
         self._magnitudes = model.disturbance_magnitudes
         self._sensors: Sensors | None = None

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from controllers.economic import linear_model
-from controllers.functions import StackedFunction
+from controllers.functions import StackedFunction, define
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters
@@ -40,10 +40,10 @@ class OneStepModel:
         nominal = ca.DM(self._model.nominal_parameters)
         # Two functions: that of the nominal parameters is called in every sample.
         nominal_step = step(x, u, d, nominal)
-        self._nominal = StackedFunction("f", {"x": x, "u": u}, {"y": nominal_step})
+        self._nominal = StackedFunction(define("f", {"x": x, "u": u}, {"y": nominal_step}))
         parametric_step = step(x, u, d, p)
         inputs = {"x": x, "u": u, "p": p}
-        self._parametric = StackedFunction("f", inputs, {"y": parametric_step})
+        self._parametric = StackedFunction(define("f", inputs, {"y": parametric_step}))
 
     def __call__(self, s: Vector, a: Vector) -> Vector:
         """Prediction for state s (n,) and action a (m,)."""

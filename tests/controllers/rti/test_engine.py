@@ -56,6 +56,10 @@ def compiled(request, monkeypatch):
     return request.param
 
 
+condensed_alone = pytest.mark.parametrize("compiled", ["condensed"], indirect=True)
+"""Of the plant in the loop, which does not know how the QP is solved."""
+
+
 @pytest.fixture(scope="module")
 def learnt(request):
     problem = evaporator_problem(horizon=getattr(request, "param", 10))
@@ -73,7 +77,7 @@ def test_it_gives_what_the_interpreter_gives(learnt, gap):
     ours, reference = both(problem, parameters)
     rng, worst = np.random.default_rng(0), dict.fromkeys(BOUNDS, 0.0)
     s = problem.reference_state
-    for k in range(200):
+    for k in range(100):
         ours.prepare()
         reference.prepare()
         got, wanted = ours.feedback(s), reference.feedback(s)
@@ -182,6 +186,7 @@ def test_its_own_loop_gives_the_bytes_of_pythons(monkeypatch, scenario):
     assert set(run.status) == {"solved"}
 
 
+@condensed_alone
 def test_its_loop_meets_the_plants_changes(monkeypatch):
     loaded = Scenario.load("paper").replace(
         {"plant": {"changes": [{"time": 1800.0, "parameters": {"UA2": 5.2}}]}}
@@ -195,6 +200,7 @@ def test_its_loop_meets_the_plants_changes(monkeypatch):
     assert runs[0] == runs[1]
 
 
+@condensed_alone
 @pytest.mark.parametrize("fmu", ["evaporator", "evaporator_fmi3"])
 @pytest.mark.parametrize("order", Order)
 def test_its_loop_reads_the_outputs_in_each_order(monkeypatch, order, fmu):

@@ -46,6 +46,12 @@ EVALUATION_FILES = (
 )
 """Files of an evaluation; all in a folder belong to one."""
 MOST_SEEDS = 1_000_000
+WORKER_START = 2.0
+"""Seconds of work below which starting workers takes longer than doing it."""
+ITEM_SECONDS = 0.5
+"""Seconds of an item of work of our own code, about: each moves the bar."""
+ITEM_SAMPLES = 200
+"""Samples of an item of others' code, about: few, since a plant may take its time."""
 Progress = Callable[[int, str, str], None]
 """Called with the plant samples done, what is done in words, and a line about an event, or ""."""
 
@@ -131,17 +137,32 @@ def _measure_all(
     command: str,
 ) -> Evaluation:
     """Measure each of the controllers on the noise; the `wanted` have rows of their own."""
-    items: dict[tuple[str, int], MeasureItem] = {}
+    runs: dict[str, MeasureItem] = {}
+    seconds = {}
     parameters = {}
     for name, description in named.items():
         source = ControllerSource.read(description) if isinstance(description, str) else description
         conditions = Conditions.of_now(scenario, description)
+        runs[name] = MeasureItem(conditions, source, noise, noise.length)
         # Built here once, so that a fault shows before any worker starts.
         parameters[name] = parameters_hash(built(source, conditions.scenario))
-        all_seeds = MeasureItem(conditions, source, noise, noise.length)
-        for part in all_seeds.parts():
-            items[name, part.noise.seeds[0]] = part
+        if conditions.all_ours and isinstance(description, str):
+            seconds[name] = runs[name].seconds_a_run()
     facts = conditions.facts
+    n_seeds = len(noise.seeds)
+    all_timed = len(seconds) == len(runs)
+    if all_timed and n_seeds * sum(seconds.values()) < WORKER_START:
+        jobs = 1
+    items: dict[tuple[str, int], MeasureItem] = {}
+    for name, run in runs.items():
+        if name in seconds:
+            size = int(ITEM_SECONDS / seconds[name]) + 1
+        else:
+            # Code of others may remember one run in the next, and may end its process: its items
+            # are always the same, and it is not run here to be timed.
+            size = max(1, ITEM_SAMPLES // noise.length)
+        for part in run.parts(min(n_seeds, size)):
+            items[name, part.noise.seeds[0]] = part
     measured = {name: Measured() for name in named}
     n_done = 0
     total = len(named) * noise.samples

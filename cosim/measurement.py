@@ -14,10 +14,12 @@ from cosim.core.protocols import Controller, Vector
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import measure, simulate
 from cosim.plant import FmuPlant
-from cosim.workers import Item
+from cosim.workers import Failure, Item, perform
 
-ITEM = 20_000
-"""Samples of an item, about: a few seconds of work."""
+PROBE_STEPS = 10
+"""Samples of the first run that shows how long a sample takes."""
+PROBE_SECONDS = 0.02
+"""Length of a run that shows it: in a shorter one a run's own start counts."""
 Factory = Callable[[Scenario], Controller]
 Indicators = dict[str, float]
 
@@ -96,13 +98,29 @@ class MeasureItem(Item[Measured]):
                 measured.timing[seed] = timing
         return measured
 
-    def parts(self) -> Iterator[MeasureItem]:
-        """Items of about `ITEM` samples, the same ones for any number of workers."""
+    def parts(self, n_seeds: int) -> Iterator[MeasureItem]:
+        """Items of so many seeds each, the last of the rest."""
         seeds = self.noise.seeds
-        size = max(1, ITEM // self.noise.length)
-        for first in range(0, len(seeds), size):
-            noise = self.noise._replace(seeds=seeds[first : first + size])
+        for first in range(0, len(seeds), n_seeds):
+            noise = self.noise._replace(seeds=seeds[first : first + n_seeds])
             yield replace(self, noise=noise)
+
+    def seconds_a_run(self) -> float:
+        """Time of a run on one seed in this process, from short ones, each longer than the last.
+
+        Raises what building and running the controller raises.
+        """
+        seed = self.noise.seeds[0]
+        steps = min(PROBE_STEPS, self.noise.length)
+        while True:
+            probe = replace(self, noise=Noise((seed,), steps))
+            result = perform(probe).result
+            if isinstance(result, Failure):
+                raise result.error()
+            seconds = result.timing[seed]["wall_time_s"]
+            if seconds > PROBE_SECONDS or steps == self.noise.length:
+                return seconds / steps * self.noise.length
+            steps = min(5 * steps, self.noise.length)
 
     def _built(self) -> Controller:
         """The controller, compiled where its runs are long."""

@@ -85,6 +85,12 @@ class Conditions:
         facts = depends_on(scenario, *parts, files=files)
         return cls(scenario, facts, parts, files or {}, import_folders())
 
+    @property
+    def all_ours(self) -> bool:
+        """Whether nothing but our own code runs: no plug-in, no FMU in a file."""
+        plugins = any(name.startswith("plug-in") for name in self.facts)
+        return not plugins and not is_file(self.scenario.plant.fmu)
+
     def facts_here(self) -> dict[str, str]:
         """What this process has in the place of `facts`."""
         for folder in self.folders:

@@ -60,6 +60,8 @@ TYPES: dict[str, Any] = {
     "seed": "uint64",
 }
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
+ITEM_SAMPLES = 20_000
+"""Samples of an item of an evaluation, about: some seconds where nothing is compiled."""
 PAUSE = 20
 """Least time between two writes of the tables, in multiples of the time that one takes."""
 TRAINING = ""
@@ -472,7 +474,8 @@ class RunStore:
             missing = noise._replace(seeds=self.missing(file))
             self.done += noise.samples - missing.samples
             if missing.seeds:
-                for part in self._evaluation(file, missing).parts():
+                n_seeds = max(1, ITEM_SAMPLES // noise.length)
+                for part in self._evaluation(file, missing).parts(n_seeds):
                     yield file, part
 
     def _evaluation(self, file: str, noise: Noise) -> MeasureItem:

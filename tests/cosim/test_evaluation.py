@@ -7,6 +7,7 @@ import pytest
 from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
 from cosim.core.errors import EvaluationError
+from cosim.workers import done
 from tests.helpers.loop import Proportional, hold, proportional
 from tests.helpers.workers import LEDGER, always_dying, mortal, noting
 
@@ -52,6 +53,26 @@ def test_gain_and_gap_are_taken_against_naive_and_optimal(paper):
 
 def test_two_workers_give_the_bytes_of_one(paper):
     assert contents(evaluate(paper, BOTH, 4, 40, jobs=2)) == contents(evaluate(paper, BOTH, 4, 40))
+
+
+def test_short_work_of_our_own_code_starts_no_worker(paper, monkeypatch):
+    alone = contents(evaluate(paper, ["naive"], 2, 20))
+    monkeypatch.setattr("loky.ProcessPoolExecutor", None)
+    assert contents(evaluate(paper, ["naive"], 2, 20, jobs=2)) == alone
+    with pytest.raises(TypeError):
+        evaluate(paper, {"hold": hold}, 2, 20, jobs=2)
+
+
+def test_few_samples_of_others_code_are_work_for_more_than_one_worker(paper, monkeypatch):
+    given = []
+
+    def noting_items(items, *rest):
+        given.extend(items)
+        return done(items, *rest)
+
+    monkeypatch.setattr("cosim.evaluation.done", noting_items)
+    evaluate(paper, {"hold": hold}, 8, 50)
+    assert [key for key in given if key[0] == "hold"] == [("hold", 0), ("hold", 4)]
 
 
 def test_every_evaluation_computes_and_writes_its_tables(paper, tmp_path, ledger):

@@ -116,6 +116,14 @@ def test_an_edit_of_any_python_file_beside_a_plug_in_is_seen(plug, tmp_path, pap
     assert changed(before, depends_on(paper, name)) == [f"plug-in {name.partition(':')[0]}"]
 
 
+def test_an_edit_of_the_plants_own_model_is_seen(plug, paper):
+    name, path, _ = plug
+    scenario = paper.replace({"plant": {"model": name}})
+    before = depends_on(scenario)
+    path.write_text(path.read_text() + "# edited\n")
+    assert changed(before, depends_on(scenario)) == [f"plug-in {name.partition(':')[0]}"]
+
+
 def test_two_files_of_one_name_are_refused(plug, tmp_path):
     name, path, _ = plug
     (tmp_path / "other").mkdir()

@@ -83,6 +83,12 @@ def test_bias_is_the_mean_that_saturation_leaves(rng, action):
     assert explore.bias(action[None])[0] == pytest.approx(measured, abs=0.15)
 
 
+def test_bias_is_of_actions_about_zero_too(rng):
+    explore = make("literal", deviation=(150.0,))
+    measured = (draws(explore, rng) - POLICY).mean(axis=0)
+    assert explore.bias(POLICY[None])[0] == pytest.approx(measured, abs=2.0)
+
+
 def test_noise_is_drawn_alike_whatever_the_probability():
     paired = []
     for probability in (0.0, 1.0):

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from controllers.economic import tune
+from controllers.rti import RtiNmpc
 from learning.log import to_csv
-from learning.policy_search import Coordinates
+from learning.policy_search import Coordinates, PolicySearch
 from learning.training import run_training
 from tests.helpers.training import killed_and_resumed, make_run
 
@@ -32,6 +33,16 @@ def test_the_final_theta_is_the_mean_and_improves():
     costs = [row["J"] for row in result.rows[1:]]
     assert costs[2] < costs[0]
     assert result.evaluation["J"] == result.rows[-1]["greedy_J"]
+
+
+def test_what_a_stretch_costs_at_first_does_not_count(scenario, problem, tuned_theta, rng):
+    settings = PolicySearch.Configuration.from_dict({"population": 4, "episode": 15})
+    controller = RtiNmpc(problem, tuned_theta)
+    rule = PolicySearch(controller, scenario, settings, 100, None, rng)
+    horizon = scenario.controller.horizon
+    for cost in [1e6] * horizon + [2.0] * (15 - horizon):
+        rule.failed(cost)
+    assert rule.state_dict()["evaluated"].tolist() == [2.0]
 
 
 def test_coordinates_begin_at_the_start_and_stay_definite(scenario, problem, rng):

@@ -51,6 +51,26 @@ def test_expected_cost_and_penalty_agree_with_monte_carlo(linear, quadratic, sta
     assert value == pytest.approx(sampled.mean(), abs=uncertain)
 
 
+@pytest.mark.parametrize(("linear", "quadratic"), [(3.0, 0.5), (0.5, 300.0)])
+def test_without_noise_the_penalty_is_that_of_the_next_state(linear, quadratic):
+    problem = replace(
+        PROBLEM,
+        penalty_linear=np.full(2, linear),
+        penalty_quadratic=np.full(2, quadratic),
+    )
+    nominal = PROBLEM.model.nominal_disturbance
+    still = DisturbanceLaw("uniform", nominal, np.zeros(4))
+    state = STATE - [[3.0, 0.0]]
+    x_next = discretise(PROBLEM.model, 60.0, 8)(state[0], ACTION[0], nominal, P).full()[:, 0]
+    violation = max(25.0 - x_next[0], 0.0)
+    assert violation > 0.4
+    cost = float(economic_cost(PROBLEM.model)(state[0], ACTION[0], nominal, P))
+    expected = cost + linear * violation + quadratic * violation**2
+    plant = PlantProblem(problem, still, P)
+    value = operator(plant=plant).values(state, ACTION, GRID, np.zeros(GRID.size))[0]
+    assert value == pytest.approx(expected, rel=1e-9)
+
+
 def test_penalty_needs_and_has_more_nodes_than_the_smooth_part():
     def value(nodes):
         return operator(penalty_nodes=nodes).values(STATE, ACTION, GRID, np.zeros(GRID.size))[0]

@@ -10,6 +10,7 @@ from cosim.studies.operation import (
     compare_shifts,
     operation_result,
     operation_tables,
+    plant_at,
 )
 from tests.helpers.toy_study import GROW, SCENARIO
 
@@ -105,3 +106,10 @@ def test_cases_with_other_training_seeds_are_compared_on_those_that_both_have():
     )
     assert pair == "a − b"
     assert difference.startswith("5.00")
+
+
+def test_theta_is_evaluated_on_the_plant_as_it_is_then(paper):
+    change = {"time": 1800.0, "parameters": {"UA2": 5.2}}
+    scenario = paper.replace({"plant": {"changes": [change]}})
+    assert "UA2" not in plant_at(scenario, 1740.0).plant.parameters
+    assert plant_at(scenario, 1800.0).plant.parameters["UA2"] == 5.2

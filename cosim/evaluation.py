@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ from cosim.core.simulation import indicators, measure, reporting, simulate
 from cosim.core.validation import instead, whole_number
 from cosim.measurement import Factory, Measured, MeasureItem, Noise, built
 from cosim.plant import FmuPlant
-from cosim.workers import Conditions, Failure, done
+from cosim.workers import Conditions, Failure, cores, done
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,6 +46,8 @@ EVALUATION_FILES = (
 )
 """Files of an evaluation; all in a folder belong to one."""
 MOST_SEEDS = 1_000_000
+WORTH_WORKERS = 3.0
+"""Seconds of work for which worker processes are started: they take a second to import this."""
 Progress = Callable[[int, str, str], None]
 """Called with the plant samples done, what is done in words, and a line about an event, or ""."""
 
@@ -66,7 +68,7 @@ def evaluate(
     steps: int,
     *,
     folder: str | Path | None = None,
-    jobs: int = 1,
+    jobs: int | None = 1,
     scheduler: str | None = None,
     progress: Progress | bool = False,
     command: str = "cosim.evaluate",
@@ -84,7 +86,8 @@ def evaluate(
         seeds: the seeds, or their number S for 0 … S−1.
         steps: samples per run, from the scenario's initial state on.
         folder: where the tables are written at the end (`Evaluation.write`); None writes none.
-        jobs: worker processes; 1 works in this process.
+        jobs: worker processes at most; 1 works in this process, None has one per core. Work of few
+            seconds, as the first seed of a controller shows, stays in this process.
         scheduler: address of a Dask scheduler, used in place of `jobs`.
         progress: called as `cosim.study` does; True draws a bar.
         command: the text of the column `command`.
@@ -102,6 +105,8 @@ def evaluate(
         scenario = Scenario.load(scenario)
     seed_numbers = _distinct_seeds(seeds)
     steps = whole_number("steps", steps, 1, EvaluationError)
+    if jobs is not None:
+        jobs = whole_number("jobs", jobs, 1, EvaluationError)
     named = named_controllers(controllers)
     _check_names(named)
     wanted = list(named)
@@ -125,35 +130,29 @@ def _measure_all(
     named: Mapping[str, Factory | str],
     wanted: Sequence[str],
     noise: Noise,
-    jobs: int,
+    jobs: int | None,
     scheduler: str | None,
     progress: Progress | bool,
     command: str,
 ) -> Evaluation:
     """Measure each of the controllers on the noise; the `wanted` have rows of their own."""
-    items: dict[tuple[str, int], MeasureItem] = {}
+    whole: dict[str, MeasureItem] = {}
     parameters = {}
     for name, description in named.items():
         source = ControllerSource.read(description) if isinstance(description, str) else description
         conditions = Conditions.of_now(scenario, description)
         # Built here once, so that a fault shows before any worker starts.
         parameters[name] = parameters_hash(built(source, conditions.scenario))
-        all_seeds = MeasureItem(conditions, source, noise, noise.length)
-        for part in all_seeds.parts():
-            items[name, part.noise.seeds[0]] = part
+        whole[name] = MeasureItem(conditions, source, noise, noise.length)
     facts = conditions.facts
     measured = {name: Measured() for name in named}
     n_done = 0
     total = len(named) * noise.samples
     with reporting(progress, scenario.name, total) as report:
-        for key, result in done(items, jobs, scheduler):
-            # A mean over fewer seeds would be another figure under the same name.
-            if isinstance(result, Failure):
-                raise result.error()
-            name = key[0]
+        for item, name, result in _results(whole, jobs, scheduler):
             measured[name].indicators.update(result.indicators)
             measured[name].timing.update(result.timing)
-            n_done += items[key].noise.samples
+            n_done += item.noise.samples
             report(n_done, f"{n_done / total:.0%}", "")
     columns = {}
     timing = {}
@@ -178,6 +177,64 @@ def _measure_all(
             "command": command,
         },
     )
+
+
+def _results(
+    whole: Mapping[str, MeasureItem], jobs: int | None, scheduler: str | None
+) -> Iterator[tuple[MeasureItem, str, Measured]]:
+    """Do the work in items; yield each, its controller's name and its result.
+
+    The first seed of a controller is run in this process and says how long the others take: that
+    decides on the items and on whether workers are worth their start.
+    """
+    remaining = dict(whole)
+    seconds: dict[str, float | None] = dict.fromkeys(whole)
+    for name, item in whole.items():
+        # A user's factory may end its process: where workers were asked for, that is a worker's.
+        in_worker = jobs != 1 and not isinstance(item.controller, ControllerSource)
+        if scheduler is not None or in_worker:
+            continue
+        if jobs != 1 and _seconds_left(remaining, seconds) > WORTH_WORKERS:
+            break
+        first = item.first_seed()
+        for _, result in _succeeded({(name, 0): first}, 1, None):
+            seed = first.noise.seeds[0]
+            seconds[name] = result.timing[seed]["wall_time_s"]
+            yield first, name, result
+        others = item.noise._replace(seeds=item.noise.seeds[1:])
+        remaining[name] = replace(item, noise=others)
+    items: dict[tuple[str, int], MeasureItem] = {}
+    for name, item in remaining.items():
+        for number, part in enumerate(item.timed_parts(seconds[name])):
+            items[name, number] = part
+    not_timed = [name for name in whole if seconds[name] is None]
+    if not not_timed and _seconds_left(remaining, seconds) <= WORTH_WORKERS:
+        jobs = 1
+    elif jobs is None and scheduler is None:
+        jobs = cores()
+    for key, result in _succeeded(items, jobs or 1, scheduler):
+        yield items[key], key[0], result
+
+
+def _seconds_left(
+    remaining: Mapping[str, MeasureItem], seconds: Mapping[str, float | None]
+) -> float:
+    """Seconds that the seeds take which remain of the controllers that were timed."""
+    total = 0.0
+    for name, item in remaining.items():
+        total += len(item.noise.seeds) * (seconds[name] or 0.0)
+    return total
+
+
+def _succeeded(
+    items: Mapping[tuple[str, int], MeasureItem], jobs: int, scheduler: str | None
+) -> Iterator[tuple[tuple[str, int], Measured]]:
+    """What `done` yields; raises the error of an item that failed."""
+    for key, result in done(items, jobs, scheduler):
+        # A mean over fewer seeds would be another figure under the same name.
+        if isinstance(result, Failure):
+            raise result.error()
+        yield key, result
 
 
 def _frame(rows: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> pd.DataFrame:

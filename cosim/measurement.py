@@ -17,7 +17,11 @@ from cosim.plant import FmuPlant
 from cosim.workers import Item
 
 ITEM = 20_000
-"""Samples of an item, about: a few seconds of work."""
+"""Samples of an item, at most about."""
+ITEM_SECONDS = 1.0
+"""Seconds that an item may take, where one seed does not take longer."""
+FEWEST = 8
+"""Items of a work at least, where it is not known how long a seed takes, and there are seeds."""
 Factory = Callable[[Scenario], Controller]
 Indicators = dict[str, float]
 
@@ -98,8 +102,31 @@ class MeasureItem(Item[Measured]):
 
     def parts(self) -> Iterator[MeasureItem]:
         """Items of about `ITEM` samples, the same ones for any number of workers."""
+        return self._of_seeds(self._most_seeds())
+
+    def first_seed(self) -> MeasureItem:
+        """The first seed alone, which shows how long one takes."""
+        return replace(self, noise=self.noise._replace(seeds=self.noise.seeds[:1]))
+
+    def timed_parts(self, seconds: float | None) -> Iterator[MeasureItem]:
+        """Items of at most `ITEM` samples and about `ITEM_SECONDS`: a plant may be slow.
+
+        Args:
+            seconds: that a seed takes; None where it is not known.
+        """
+        if seconds is None:
+            most = -(-len(self.noise.seeds) // FEWEST)
+        else:
+            most = int(min(ITEM_SECONDS / max(seconds, 1e-9), ITEM))
+        return self._of_seeds(max(1, min(most, self._most_seeds())))
+
+    def _most_seeds(self) -> int:
+        """Seeds of an item of `ITEM` samples, at least one."""
+        return max(1, ITEM // self.noise.length)
+
+    def _of_seeds(self, size: int) -> Iterator[MeasureItem]:
+        """Items of so many seeds each."""
         seeds = self.noise.seeds
-        size = max(1, ITEM // self.noise.length)
         for first in range(0, len(seeds), size):
             noise = self.noise._replace(seeds=seeds[first : first + size])
             yield replace(self, noise=noise)

@@ -1,4 +1,5 @@
 import json
+import os
 import sys
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
 from cosim.core.errors import EvaluationError
+from cosim.measurement import MeasureItem, Noise
+from cosim.workers import Conditions
 from tests.helpers.loop import Proportional, hold, proportional
 from tests.helpers.workers import LEDGER, always_dying, mortal, noting
 
@@ -52,6 +55,32 @@ def test_gain_and_gap_are_taken_against_naive_and_optimal(paper):
 
 def test_two_workers_give_the_bytes_of_one(paper):
     assert contents(evaluate(paper, BOTH, 4, 40, jobs=2)) == contents(evaluate(paper, BOTH, 4, 40))
+
+
+def test_work_of_seconds_starts_no_worker(paper, ledger):
+    small = evaluate(paper, {"noting": "tests.helpers.workers:noting"}, 3, 20, jobs=2)
+    assert set(ledger()) == {str(os.getpid())}
+    assert len(ledger()) == 3
+    assert contents(small) == contents(evaluate(paper, {"noting": noting}, 3, 20))
+
+
+@pytest.mark.slow
+def test_a_slow_plant_is_split_among_workers_after_its_first_seed(paper, ledger):
+    split = evaluate(paper, {"slow": "tests.helpers.workers:slow"}, 8, 25, jobs=2)
+    first, *others = ledger()
+    assert first == str(os.getpid())
+    assert first not in others
+    assert len(set(others)) == 2, "one of the workers had nothing to do"
+    assert contents(split) == contents(evaluate(paper, {"slow": noting}, 8, 25))
+
+
+def test_items_are_sized_by_the_seconds_of_a_seed(paper):
+    conditions = Conditions.of_now(paper)
+    item = MeasureItem(conditions, hold, Noise(tuple(range(50)), 40), 40)
+    for seconds, most in ((3.0, 1), (0.1, 10), (1e-6, 50), (0.0, 50), (None, 7)):
+        parts = [part.noise.seeds for part in item.timed_parts(seconds)]
+        assert max(map(len, parts)) == most
+        assert sum(parts, ()) == item.noise.seeds
 
 
 def test_every_evaluation_computes_and_writes_its_tables(paper, tmp_path, ledger):

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -25,6 +26,18 @@ class Noting(Proportional):
 
 def noting(scenario):
     return Noting(scenario)
+
+
+class Slow(Noting):
+    """Takes twenty milliseconds a sample, as a large FMU does."""
+
+    def prepare(self):
+        time.sleep(0.02)
+        super().prepare()
+
+
+def slow(scenario):
+    return Slow(scenario)
 
 
 class Mortal(Noting):

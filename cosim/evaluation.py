@@ -27,7 +27,7 @@ from cosim.core.simulation import indicators, measure, reporting, simulate
 from cosim.core.validation import instead, whole_number
 from cosim.measurement import Factory, Measured, MeasureItem, Noise, built
 from cosim.plant import FmuPlant
-from cosim.workers import Conditions, Failure, done
+from cosim.workers import Conditions, Failure, cores, done
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,7 +72,7 @@ def evaluate(
     steps: int,
     *,
     folder: str | Path | None = None,
-    jobs: int = 1,
+    jobs: int | None = 1,
     scheduler: str | None = None,
     progress: Progress | bool = False,
     command: str = "cosim.evaluate",
@@ -90,7 +90,8 @@ def evaluate(
         seeds: the seeds, or their number S for 0 … S−1.
         steps: samples per run, from the scenario's initial state on.
         folder: where the tables are written at the end (`Evaluation.write`); None writes none.
-        jobs: worker processes; 1 works in this process.
+        jobs: worker processes at most; 1 works in this process, None has one per core. Work of our
+            own code that takes less time than their start is done in this process.
         scheduler: address of a Dask scheduler, used in place of `jobs`.
         progress: called as `cosim.study` does; True draws a bar.
         command: the text of the column `command`.
@@ -131,7 +132,7 @@ def _measure_all(
     named: Mapping[str, Factory | str],
     wanted: Sequence[str],
     noise: Noise,
-    jobs: int,
+    jobs: int | None,
     scheduler: str | None,
     progress: Progress | bool,
     command: str,
@@ -153,6 +154,8 @@ def _measure_all(
     all_timed = len(seconds) == len(runs)
     if all_timed and n_seeds * sum(seconds.values()) < WORKER_START:
         jobs = 1
+    elif jobs is None:
+        jobs = cores()
     items: dict[tuple[str, int], MeasureItem] = {}
     for name, run in runs.items():
         if name in seconds:

@@ -16,8 +16,6 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, Self, TypeVar
 
-import loky
-
 from cosim.core.errors import EvaluationError
 from cosim.core.modules import OURS, import_folders, import_from
 from cosim.core.processes import Terminated, follow_parent, without_interrupts
@@ -205,6 +203,13 @@ def done(
                 ) from None
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    from loky import cpu_count  # noqa: PLC0415 - a third of a second
+
+    return int(cpu_count())
+
+
 def begin_worker(parent: int) -> None:
     """Leave Ctrl-C to the parent, and end with it."""
     # Python sets a handler in the main thread alone.
@@ -229,6 +234,8 @@ def _reports(
     if jobs == 1:
         yield from (_with_key(key, item) for key, item in list(items.items()))
         return
+    import loky  # noqa: PLC0415 - a third of a second, which work in this process need not take
+
     # The workers are as many as the cores: more threads would wait for each other.
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     workers = loky.ProcessPoolExecutor(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import inf, isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,8 @@ from learning.verdict import cost_difference
 
 class Evaluator:
     """Evaluates a run's θ by its greedy policy on the held-out seeds.
+
+    Without a seed no plant steps, no figure is known, and no limit is set.
 
     Args:
         run: says how many seeds and samples.
@@ -45,12 +47,17 @@ class Evaluator:
     ) -> None:
         self._run = run
         self._plant = plant
+        self.baselines: dict[str, float] = {}
+        if not run.evaluation_seeds:
+            self.start = _nothing_known()
+            self.limit = inf
+            return
         self._controller = nmpc(run.scenario, start, run.controller)
         self._law = measured(run.scenario, self._controller)
         naive = Parameters.naive(Problem.from_scenario(run.scenario))
         naive_law = measured(run.scenario, nmpc(run.scenario, naive, run.controller))
         naive_costs = self._costs(naive_law)["J"]
-        self.baselines = {"naive": float(naive_costs.mean())}
+        self.baselines["naive"] = float(naive_costs.mean())
         self._optimal_costs = np.full(run.evaluation_seeds, np.nan)
         if optimum is not None:
             self._optimal_costs = self._costs(optimum)["J"]
@@ -72,8 +79,10 @@ class Evaluator:
             Means of `METRICS`, `failures` a sum; `difference` of J from the start's and its
             `difference_interval`; `regret`, its `regret_interval`, and `gap_closed`, the share of
             the start's regret that is gone, None where unknown. Intervals are of 95 %, over the
-            seeds.
+            seeds. Without a seed all numbers are NaN.
         """
+        if not self._run.evaluation_seeds:
+            return self.start
         # A training ends with the θ of its last row, and a rule may leave θ as it is.
         if not np.array_equal(theta, self._theta):
             self._controller.theta = theta
@@ -103,3 +112,10 @@ class Evaluator:
         # All runs together say whether compiling pays.
         compile_functions(policy, self._run.evaluation_steps * len(seeds))
         return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)
+
+
+def _nothing_known() -> dict[str, Any]:
+    """What `evaluate` returns where no held-out run is made."""
+    metrics: dict[str, Any] = dict.fromkeys((*METRICS, "failures", "difference"), nan)
+    unknown = ("difference_interval", "regret", "regret_interval", "gap_closed")
+    return metrics | dict.fromkeys(unknown)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtr
 
 from cosim.core.protocols import Array, Vector
 from learning.checkpoint import State
@@ -56,7 +56,9 @@ def exceeds(one: ShownCost, other: ShownCost, probability: float) -> bool:
     # Equal variances that are both zero leave no test: then the means decide.
     if one.variance + other.variance == 0:
         return one.mean > other.mean
-    test = stats.ttest_ind(one.batches, other.batches, equal_var=False, alternative="greater")
+    from scipy.stats import ttest_ind  # noqa: PLC0415 - most of a second, of few trainings
+
+    test = ttest_ind(one.batches, other.batches, equal_var=False, alternative="greater")
     return bool(test.pvalue < probability)
 
 
@@ -73,7 +75,7 @@ def exceeds_prediction(cost: ShownCost, predicted: float, probability: float) ->
     excess = cost.mean - predicted
     if cost.variance == 0:
         return excess > 0
-    tail = stats.t.sf(excess / cost.variance**0.5, len(cost.batches) - 1)
+    tail = stdtr(len(cost.batches) - 1, -excess / cost.variance**0.5)
     return bool(tail < probability)
 
 

@@ -47,7 +47,7 @@ from learning.evaluator import Evaluator
 from learning.log import LOG_COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
 from learning.training_run import TrainingRun, begin_training, make_run
-from learning.verdict import WORSE, Verdict, verdict
+from learning.verdict import NO_DIFFERENCE, WORSE, Verdict, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -134,6 +134,8 @@ class Training(Result):
     @property
     def verdict(self) -> Verdict:
         """Whether the learned θ is shown to be better than the start, or worse."""
+        if not self.run.evaluation_seeds:
+            return NO_DIFFERENCE
         return verdict(self.difference)
 
     @property
@@ -150,6 +152,19 @@ class Training(Result):
     def retreats(self) -> int:
         """How often θ went back to one that had been shown to cost less."""
         return int(_total(row["retreats"] for row in self.rows))
+
+    @property
+    def held_out_samples(self) -> int:
+        """Plant samples of the held-out runs, beside those of the training."""
+        run = self.run
+        evaluations = len(self.baselines) + 1
+        theta = self.start.theta
+        for row in self.rows[1:]:
+            # The same θ once more is not run again.
+            if not isnan(row["greedy_J"]) and not np.array_equal(row.parameters.theta, theta):
+                evaluations += 1
+                theta = row.parameters.theta
+        return evaluations * run.evaluation_seeds * run.evaluation_steps
 
     @property
     def regret(self) -> float:
@@ -262,6 +277,7 @@ class Training(Result):
             "start": run.start,
             "samples": int(last["samples"]),
             "plant_samples": self.plant_samples,
+            "held_out_samples": self.held_out_samples,
             "seed": run.seed,
             "status": self.status,
             "hyperparameters": run.configuration.model_dump(mode="json"),
@@ -393,7 +409,8 @@ def run_training(
             session.checkpoint()
         evaluator = Evaluator(run, evaluation_plant, session.start, best)
         with reporting(progress, run.algorithm, run.samples, _Remark()) as report:
-            status = session.run_to_the_end(evaluator, report)
+            # A function of the user's gets the rows of the log, a bar moves between them.
+            status = session.run_to_the_end(evaluator, report, between=progress is True)
         learned = session.loop.parameters
         training = Training(
             run=run,
@@ -454,8 +471,23 @@ class _Session:
         self.updates: list[Update] = []
         self.without_checkpoint: str | None = None
 
-    def run_to_the_end(self, evaluator: Evaluator, progress: Callable[[int, LogRow], None]) -> str:
-        """Take all samples, with log, evaluations and checkpoints; `finished` or `diverged: …`."""
+    def run_to_the_end(
+        self,
+        evaluator: Evaluator,
+        progress: Callable[[int, LogRow], None],
+        between: bool = False,
+    ) -> str:
+        """Take all samples, with log, evaluations and checkpoints.
+
+        Args:
+            evaluator: of θ on held-out noise.
+            progress: gets the samples done and the log's last row.
+            between: whether it is called between the rows, too, each second.
+
+        Returns:
+            `finished` or `diverged: …`.
+        """
+        reported_at = time.perf_counter()
         run = self.run
         number = self.loop.counts.number
         if not self.rows:
@@ -473,6 +505,9 @@ class _Session:
             # The last sample has a row, an evaluation and a checkpoint in any case.
             last = number == run.samples
             if number % run.log_every and not last:
+                if between and time.perf_counter() - reported_at > 1.0:
+                    reported_at = time.perf_counter()
+                    progress(number, self.rows[-1])
                 continue
             evaluated = last or number % run.evaluate_every == 0
             row = self.row(number, evaluator if evaluated else None)

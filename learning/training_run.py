@@ -22,6 +22,7 @@ from cosim.core.simulation import spawn_seeds
 from cosim.core.training_options import (
     DEFAULT_SAMPLES,
     EVALUATE_EVERY,
+    EVALUATION_STEPS,
     HELD_OUT,
     LOG_EVERY,
     MOST,
@@ -32,6 +33,7 @@ from cosim.core.training_options import (
 from cosim.core.validation import suggestion
 from cosim.identity import depends_on
 from cosim.plant import FmuPlant
+from cosim.plant.fmi import SHIPPED_FMUS
 from learning.algorithm import Algorithm, load_algorithm
 from learning.backed_off import add_reserve, back_off
 from learning.configuration import Configuration
@@ -47,6 +49,10 @@ OPTION_KINDS: dict[str, type] = {"int": Integral, "float": Real, "str": str}
 """Types that stand for a field's, NumPy's numbers among them."""
 WORDS = {"int": "a whole number", "float": "a number", "str": "a text"}
 """The same in messages."""
+HELD_OUT_SHARE = 10
+"""Training samples per held-out sample, at least, on a plant that may be slow."""
+SHORTEST = 10
+"""Samples of a held-out run that says something, at least."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,7 @@ class TrainingRun(TrainingOptions):
         log_every: samples per row of the log.
         evaluate_every: samples per greedy evaluation of θ.
         checkpoint_every: samples per checkpoint.
+        evaluation_steps: samples of a held-out run.
 
     Raises:
         ConfigurationError: options of another kind, or that make no run.
@@ -77,6 +84,7 @@ class TrainingRun(TrainingOptions):
     log_every: int = LOG_EVERY
     evaluate_every: int = EVALUATE_EVERY
     checkpoint_every: int = EVALUATE_EVERY
+    evaluation_steps: int = EVALUATION_STEPS
 
     def __post_init__(self) -> None:
         completed = self.configuration.for_scenario(self.scenario)
@@ -143,7 +151,8 @@ def make_run(
         settings = rule.Configuration.from_dict(dict(settings or {}))
     if samples is None:
         samples = getattr(rule, "budget", DEFAULT_SAMPLES)
-    options = _with_intervals(options)
+    _check_samples(samples)
+    options = _with_held_out_runs(_with_intervals(options), scenario, samples)
     return TrainingRun(algorithm, scenario, samples, settings, **vars(options))
 
 
@@ -161,6 +170,27 @@ def _with_intervals(options: TrainingOptions) -> TrainingOptions:
         evaluate_every=options.evaluate_every or near_default,
         checkpoint_every=options.checkpoint_every or near_default,
     )
+
+
+def _with_held_out_runs(
+    options: TrainingOptions, scenario: Scenario, samples: int
+) -> TrainingOptions:
+    """Options with the length of the held-out runs, or without these where none fits.
+
+    How long a step of another's FMU takes is not known, and a rule by a clock would make the same
+    command give other digits: there all held-out runs together are a share of the training.
+    """
+    if options.evaluation_steps is not None:
+        return options
+    if scenario.plant.fmu in SHIPPED_FMUS or not options.evaluation_seeds:
+        return replace(options, evaluation_steps=EVALUATION_STEPS)
+    assert options.evaluate_every is not None
+    # Of θ after so many samples; at the end, of the start, of naive, and of the optimum if known.
+    evaluations = (samples - 1) // options.evaluate_every + 4
+    steps = samples // HELD_OUT_SHARE // (evaluations * options.evaluation_seeds)
+    if steps < SHORTEST:
+        return replace(options, evaluation_seeds=0, evaluation_steps=EVALUATION_STEPS)
+    return replace(options, evaluation_steps=min(steps, EVALUATION_STEPS))
 
 
 def _fitting_log_interval(evaluate_every: int | None, checkpoint_every: int | None) -> int:

@@ -41,8 +41,6 @@ def evaluate(
             CSV file a seed (run-7.csv) with the states and the actions applied.
     """
     with cli.output(json) as out_:
-        from loky import cpu_count
-
         from cosim.evaluation import EVALUATION_FILES, named_controllers
 
         task = cosim.Scenario.load(scenario)
@@ -60,7 +58,7 @@ def evaluate(
             named,
             range(first_seed, first_seed + seeds),
             steps,
-            jobs=jobs or cpu_count(),
+            jobs=jobs,
             scheduler=scheduler,
             progress=out_.live,
             command=shlex.join(["cosim", "evaluate", *words]),

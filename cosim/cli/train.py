@@ -94,6 +94,11 @@ def train(
         with cli.resumable(how):
             best = stored_optimum(run.scenario)
             training = run_training(run, folder, resume=resume, optimum=best, progress=out_.live)
+        if not training.run.evaluation_seeds:
+            out_.note(
+                "no held-out runs, so that nothing says whether θ became better; evaluate it, or "
+                "give --evaluation-steps and --evaluation-seeds"
+            )
         if reason := training.without_checkpoint:
             out_.note(f"left no checkpoint, --resume is not possible: {reason}")
         timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
@@ -130,17 +135,22 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
     title = (
         "{algorithm} ({requires}) on {scenario}, {samples} samples, seed {seed}: {status}"
     ).format(**summary)
-    rows = [
-        ("verdict", summary["verdict"]),
-        ("J of the start, on held-out noise", shown(summary["start_J"], digits=6)),
-        ("J of the learned θ, on the same", shown(summary["J"], digits=6)),
-        ("difference", shown(summary["difference"], summary["difference_interval"], 1, 3)),
+    rows = [("verdict", summary["verdict"])]
+    if summary["evaluation_seeds"]:
+        difference = shown(summary["difference"], summary["difference_interval"], 1, 3)
+        rows += [
+            ("J of the start, on held-out noise", shown(summary["start_J"], digits=6)),
+            ("J of the learned θ, on the same", shown(summary["J"], digits=6)),
+            ("difference", difference),
+            ("economic cost", shown(summary["economic_cost"], digits=6)),
+            ("mean violation", f"{summary['mean_violation']:.6f}"),
+            ("violating share", f"{100 * summary['violating_share']:.2f} %"),
+            ("failures", str(summary["failures"])),
+        ]
+    rows += [
         ("updates", str(summary["updates"])),
-        ("economic cost", shown(summary["economic_cost"], digits=6)),
-        ("mean violation", f"{summary['mean_violation']:.6f}"),
-        ("violating share", f"{100 * summary['violating_share']:.2f} %"),
-        ("failures", str(summary["failures"])),
         ("plant samples", str(summary["plant_samples"])),
+        ("plant samples of held-out runs, beside", str(summary["held_out_samples"])),
     ]
     if summary["regret"] is not None:
         rows.append(("regret %", shown(summary["regret"], summary["regret_interval"], 100, 3)))

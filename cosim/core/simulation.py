@@ -29,6 +29,12 @@ REFRESH = 0.1
 PREDICTED = ("predicted_states", "predicted_actions")
 PART = 500
 """Samples of a part; of more than 10⁵ samples it is longer, since a recording indexes each."""
+FIRST_PART = 16
+"""Samples of a compiled loop's first part; the next ones are as long as they are fast."""
+SLOW = 1e-3
+"""Seconds of a plant's step from which on a part may take longer than the next."""
+PART_SECONDS = 1.0
+"""Seconds between two reports of progress, about, where a part takes longer."""
 
 
 def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
@@ -55,7 +61,8 @@ def simulate(
 ) -> Trajectory:
     """Run a controller on a plant from the scenario's initial state (`ClosedLoop`).
 
-    A failed solve is counted; every other error is raised.
+    A failed solve is counted; every other error is raised. For a long run an NMPC that CasADi
+    interprets is compiled, and stays so (`RtiNmpc.compile`, which COSIM_COMPILE=never forbids).
 
     Args:
         plant: what is controlled.
@@ -63,7 +70,7 @@ def simulate(
         steps: number of samples.
         seed: of the plant's noise (`spawn_seeds`).
         recorder: gets the run in parts.
-        progress: gets the number of samples done; True draws a bar.
+        progress: gets the number of samples done, each second or so; True draws a bar.
         residuals: whether the KKT residuals, which may cost time, are asked for; else they are NaN.
 
     Returns:
@@ -73,6 +80,7 @@ def simulate(
         RunEndedError: the plant failed in mid run; its `trajectory` has the samples before.
     """
     steps = whole_number("steps", steps, 1, CosimError)
+    _compile(controller, steps)
     # The columns are there before the recorder opens its file: they may not fit the memory.
     run = _Run(plant, controller, steps, seed, residuals)
     if recorder is not None:
@@ -96,6 +104,13 @@ def simulate(
         ended.trajectory = run.trajectory()
         raise ended from error
     return run.trajectory()
+
+
+def _compile(controller: Controller, steps: int) -> None:
+    """Compile an interpreted NMPC, behind an estimator too, if the run is long enough for it."""
+    nmpc: Any = getattr(controller, "controller", controller)
+    if functions_of(nmpc) == "interpreted" and hasattr(type(nmpc), "compile"):
+        nmpc.compile(steps)
 
 
 def compiled_loop(plant: Plant, controller: Controller) -> CompiledLoop | None:
@@ -167,6 +182,7 @@ class _Run:
         loop = self._loop
         s = self._plant.reset(spawn_seeds(self._seed)[0])
         loop.start(s, getattr(self._plant, "y", None))
+        reported_at = perf_counter()
         try:
             for k in range(self._steps):
                 sample = loop.advance()
@@ -177,6 +193,9 @@ class _Run:
                     self._keep_prediction(k, solution)
                 if (k + 1) % self._length == 0 or k + 1 == self._steps:
                     self._store(rows, record)
+                    progress(k + 1)
+                elif sample.plant_time > SLOW and perf_counter() - reported_at > PART_SECONDS:
+                    reported_at = perf_counter()
                     progress(k + 1)
         except PlantError:
             # The samples before.
@@ -236,9 +255,13 @@ class _Run:
         """
         plant: Any = self._plant
         plant.reset(spawn_seeds(self._seed)[0])
-        # In parts, so that progress is shown and Ctrl-C is heard.
-        for first in range(0, self._steps, PART):
-            end = min(first + PART, self._steps)
+        # In parts, so that progress is shown and Ctrl-C is heard; short ones of a slow plant.
+        length = FIRST_PART
+        end = 0
+        while end < self._steps:
+            begin = perf_counter()
+            first = end
+            end = min(first + length, self._steps)
             table = np.full((end - first, self._ends[-1]), nan)
             try:
                 self._final_state = plant.drive(loop, table)
@@ -250,6 +273,11 @@ class _Run:
                 raise
             self._keep(first, table)
             progress(end)
+            seconds = perf_counter() - begin
+            if seconds > PART_SECONDS:
+                length = max(1, length // 2)
+            elif seconds < PART_SECONDS / 4:
+                length = min(2 * length, PART)
 
     def _keep(self, first: int, table: Array) -> None:
         """Store rows of the compiled loop with their status."""

@@ -11,7 +11,7 @@ from math import floor, isfinite, log10
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from cosim.core.protocols import Array
 
@@ -99,6 +99,8 @@ def _all_equal(values: Array, level: float) -> bool:
 
 def _bootstrap(data: Sequence[Array], statistic: Callable[..., Any], **options: Any) -> Interval:
     """Interval of a statistic of resampled data, with a fixed seed."""
+    from scipy import stats  # noqa: PLC0415 - most of a second
+
     longest = max(len(values) for values in data)
     interval = stats.bootstrap(
         tuple(data),
@@ -334,8 +336,9 @@ def _t_interval(errors: Array, value: float) -> Interval:
     """Student's interval; None for fewer than two values, or where one is not finite."""
     if len(errors) < 2 or not np.isfinite(errors).all():
         return None
-    quantile = stats.t.ppf(0.5 + LEVEL / 2, len(errors) - 1)
-    half = float(quantile * stats.sem(errors))
+    # Not by scipy.stats, which takes most of a second to import.
+    quantile = stdtrit(len(errors) - 1, 0.5 + LEVEL / 2)
+    half = float(quantile * (np.std(errors, ddof=1) / np.sqrt(len(errors))))
     return value - half, value + half
 
 
@@ -370,7 +373,9 @@ def _sign_flip_probability(differences: Array) -> float:
     count = len(differences)
     if count < 2:
         return float("nan")
-    ranks = stats.rankdata(np.abs(differences))
+    from scipy.stats import rankdata  # noqa: PLC0415 - most of a second
+
+    ranks = rankdata(np.abs(differences))
     # Sums of ranks are multiples of a half.
     observed = abs(float(np.sign(differences) @ ranks)) - 1e-9
     if count > 12:

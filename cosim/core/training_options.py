@@ -20,6 +20,8 @@ LOG_EVERY = 1000
 """Samples per row of the log, where nothing else is asked for."""
 EVALUATE_EVERY = 5000
 """Samples per greedy evaluation and per checkpoint, about, likewise."""
+EVALUATION_STEPS = 500
+"""Samples of a held-out run, where nothing else is asked for and the plant is known to be fast."""
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 MOST = 100_000_000
@@ -51,8 +53,9 @@ class TrainingOptions:
         log_every: Samples per row of the log; default: 1000, or what fits the next.
         evaluate_every: Samples per greedy evaluation; default: about 5000.
         checkpoint_every: Samples per checkpoint; default: about 5000.
-        evaluation_seeds: Held-out runs per evaluation.
-        evaluation_steps: Samples of each of them.
+        evaluation_seeds: Held-out runs per evaluation; 0: none.
+        evaluation_steps: Samples of each of them; default: 500, and on an FMU of your own what
+            keeps all of them within a tenth of the training's samples, or none.
         divergence: Times the start's J at which a run has diverged.
         rest_after: Samples after which θ stays and nothing explores; default: never.
     """
@@ -63,8 +66,8 @@ class TrainingOptions:
     log_every: int | None = _within(1, MOST, None)
     evaluate_every: int | None = _within(1, MOST, None)
     checkpoint_every: int | None = _within(1, MOST, None)
-    evaluation_seeds: int = _within(1, HELD_OUT, 4)
-    evaluation_steps: int = _within(1, MOST, 500)
+    evaluation_seeds: int = _within(0, HELD_OUT, 4)
+    evaluation_steps: int | None = _within(1, MOST, None)
     divergence: float = _within(1, None, 1.5)
     rest_after: int | None = _within(1, MOST, None)
 

@@ -3,6 +3,7 @@ import pytest
 
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim import FmuPlant
 from learning.algorithm import Update
 from learning.log import to_csv
 from learning.q_learning import QLearning
@@ -45,6 +46,35 @@ def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(
     assert result.updates == sum(row["updates"] for row in result.rows) > 3
     assert result.rows[-1]["greedy_J"] == pytest.approx(result.evaluation["J"])
     assert all(row["smallest_eigenvalue"] >= 1e-3 for row in result.rows)
+
+
+@pytest.mark.parametrize("seeds", [0, 2])
+def test_the_held_out_samples_are_those_that_the_plant_took(scenario, seeds, monkeypatch):
+    taken = []
+    step = FmuPlant.step
+
+    def counted(plant, action):
+        taken.append(plant)
+        return step(plant, action)
+
+    monkeypatch.setattr(FmuPlant, "step", counted)
+    run = make_run(scenario, "q-learning", evaluation_seeds=seeds)
+    summary = run_training(run).summary()
+    assert summary["plant_samples"] + summary["held_out_samples"] == len(taken)
+    assert bool(summary["held_out_samples"]) == bool(seeds)
+
+
+def test_without_held_out_runs_no_verdict_is_made_up(scenario, tmp_path):
+    run = make_run(scenario, "q-learning", evaluation_seeds=0)
+    result = run_training(run)
+    assert (result.status, result.verdict) == ("finished", "no difference shown")
+    assert np.array_equal(result.parameters.theta, result.learned.theta)
+    assert np.isnan([result.J, result.start_J, result.regret, result.difference.value]).all()
+    assert np.isnan(result.log()["greedy_J"]).all()
+    # With the picture.
+    result.save(tmp_path)
+    judged = run_training(make_run(scenario, "q-learning"))
+    assert np.array_equal(judged.learned.theta, result.learned.theta)
 
 
 def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):

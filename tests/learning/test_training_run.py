@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import fmus
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.core.training_options import TrainingOptions
 from learning import QLearning
@@ -32,6 +33,24 @@ def test_what_is_not_given_of_log_evaluation_and_checkpoint_fits_the_rest(
 ):
     run = make_run("q-learning", scenario, 100, options=TrainingOptions(**given))
     assert (run.log_every, run.evaluate_every, run.checkpoint_every) == expected
+
+
+@pytest.mark.parametrize("evaluate_every", [None, 1000, 5000])
+@pytest.mark.parametrize("samples", [20, 200, 1600, 1999, 10_000, 100_001])
+def test_held_out_runs_on_anothers_fmu_are_a_tenth_of_the_training(
+    scenario, samples, evaluate_every
+):
+    foreign = scenario.replace({"plant": {"fmu": str(fmus.path(scenario.plant.fmu))}})
+    options = TrainingOptions(evaluate_every=evaluate_every)
+    run = make_run("q-learning", foreign, samples, options=options)
+    # Of naive, the start and the optimum, between the samples, and at the end.
+    evaluations = 3 + (samples - 1) // run.evaluate_every + 1
+    assert 10 * evaluations * run.evaluation_seeds * run.evaluation_steps <= samples
+    assert bool(run.evaluation_seeds) == (samples >= 1600 * evaluations / 4)
+    asked = make_run("q-learning", foreign, samples, options=TrainingOptions(evaluation_steps=70))
+    assert (asked.evaluation_seeds, asked.evaluation_steps) == (4, 70)
+    ours = make_run("q-learning", scenario, samples, options=options)
+    assert (ours.evaluation_seeds, ours.evaluation_steps) == (4, 500)
 
 
 STATED = {

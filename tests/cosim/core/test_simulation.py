@@ -1,10 +1,14 @@
+import time
+
 import numpy as np
 import pytest
 
+from controllers import compile_functions
 from cosim import FmuPlant, Scenario, simulate
+from cosim.core import simulation
 from cosim.core.errors import PlantError, RunEndedError
 from cosim.core.plugins import build_controller
-from cosim.core.simulation import PART, indicators, input_effort, spawn_seeds
+from cosim.core.simulation import PART, functions_of, indicators, input_effort, spawn_seeds
 from cosim.core.trajectory import FALLBACK
 from tests.helpers.loop import Failing, Hold, Proportional
 
@@ -206,3 +210,50 @@ def test_a_plant_that_fails_in_mid_run_leaves_the_samples_before(paper, compiled
     if not compiled:
         np.testing.assert_array_equal(run.states, expected.states)
         np.testing.assert_array_equal(run.final_state, expected.final_state)
+
+
+@pytest.mark.parametrize(("steps", "functions"), [(20, "interpreted"), (1000, "compiled")])
+def test_a_long_run_from_python_is_compiled_as_by_the_command(
+    evaporator, paper, steps, functions, monkeypatch
+):
+    monkeypatch.delenv("COSIM_COMPILE", raising=False)
+    nmpc = build_controller("naive", paper)
+    run = simulate(evaporator, nmpc, steps, 0)
+    assert functions_of(nmpc) == functions
+    other = build_controller("naive", paper)
+    compile_functions(other, steps)
+    assert same(run, simulate(evaporator, other, steps, 0))
+
+
+def test_a_controller_with_a_compile_of_its_own_is_left_alone(evaporator, paper):
+    class Compiling(Proportional):
+        def compile(self, samples):
+            raise AssertionError("it was compiled")
+
+    assert len(simulate(evaporator, Compiling(paper), 1000, 0)) == 1000
+
+
+def test_a_slow_plant_reports_within_a_part(evaporator, paper, monkeypatch):
+    monkeypatch.setattr(simulation, "PART_SECONDS", 0.01)
+    step = FmuPlant.step
+
+    def slow(plant, action):
+        time.sleep(0.003)
+        return step(plant, action)
+
+    monkeypatch.setattr(FmuPlant, "step", slow)
+    reported = []
+    simulate(evaporator, Proportional(paper), 40, 0, progress=reported.append)
+    assert len(reported) > 5
+    assert reported == sorted(set(reported))
+    assert reported[-1] == 40
+
+
+def test_the_parts_of_a_slow_compiled_loop_do_not_change_its_digits(evaporator, paper, monkeypatch):
+    quick = simulate(evaporator, build_controller("naive", paper), 1000, 0)
+    monkeypatch.setattr(simulation, "PART_SECONDS", 1e-9)
+    reported = []
+    nmpc = build_controller("naive", paper)
+    slow = simulate(evaporator, nmpc, 1000, 0, progress=reported.append)
+    assert len(reported) > 900, "each part is of one sample in the end"
+    assert same(quick, slow)

@@ -6,6 +6,7 @@ same transition where that is installed (extra `outsiders`).
 """
 
 import warnings
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -24,6 +25,7 @@ INTERPRETER = "interpreter"
 AT_MOST = 60.0
 """Bound of a sample in µs."""
 EXPLORATION, WARM_UP, BLOCK, EVERY = 3.0, 20, 50, 10
+CONSTRUCTIONS = 20
 IPOPT = {"ipopt.tol": 1e-8, "ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-6}
 
 
@@ -49,7 +51,22 @@ def measure(scenario, steps):
     for phase, name, solver in references:
         times = solver(scenario, visits[::EVERY])
         rows.append(figure(f"DAQP: {phase}", ours[phase][::EVERY], name, times))
+    rows.append(figure("a controller more", *construction(scenario)))
     return rows
+
+
+def construction(scenario):
+    """Times to build a controller of a known problem, and of a new one."""
+    problem = Problem.from_scenario(scenario)
+    parameters = naive(scenario).parameters
+    known, new = [], []
+    for k in range(CONSTRUCTIONS):
+        other = replace(problem, reference_cost=problem.reference_cost + k + 1)
+        for times, one in ((new, other), (known, Problem.from_scenario(scenario))):
+            begin = clock()
+            RtiNmpc(one, parameters)
+            times.append(clock() - begin)
+    return known, "of a new problem", new
 
 
 def rti_controller(scenario, backend):

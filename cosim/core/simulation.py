@@ -261,7 +261,9 @@ class _Run:
         while end < self._steps:
             begin = perf_counter()
             first = end
-            end = min(first + length, self._steps)
+            # A part ends where Python's loop reports.
+            next_report = first - first % PART + PART
+            end = min(first + length, next_report, self._steps)
             table = np.full((end - first, self._ends[-1]), nan)
             try:
                 self._final_state = plant.drive(loop, table)
@@ -272,8 +274,9 @@ class _Run:
                 self._keep(first, table[:count])
                 raise
             self._keep(first, table)
-            progress(end)
             seconds = perf_counter() - begin
+            if end == next_report or end == self._steps or seconds > PART_SECONDS / 4:
+                progress(end)
             if seconds > PART_SECONDS:
                 length = max(1, length // 2)
             elif seconds < PART_SECONDS / 4:

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 import fmus
-from cosim import Scenario, evaluate, measurement
+from cosim import Scenario, evaluate
 from cosim.core.errors import EvaluationError, PlantError
 from tests.helpers.loop import Proportional
 
@@ -19,7 +19,7 @@ def scenario(tmp_path):
 
 
 def test_an_evaluation_ends_in_a_line_and_writes_nothing(scenario, tmp_path, monkeypatch):
-    monkeypatch.setattr(measurement, "ITEM", 20)  # an item a seed
+    monkeypatch.setattr("cosim.evaluation.ITEM_SAMPLES", 20)  # an item a seed
     runs = []
 
     def counting(described):

@@ -58,7 +58,8 @@ def training_figure(
         title: of the figure.
     """
     best = baselines.get("optimal")
-    share, error = _known(log, "greedy_violating_share"), _known(log, "td_error")
+    share = _known(log, "greedy_violating_share")
+    error = _known(log, "td_error")
     moved = _most_moved(theta)
     panels: dict[str, Callable[[Axes], Sequence[EndLabel]]] = {
         "regret %" if best is not None else "J per sample": lambda axes: _draw_cost(
@@ -69,7 +70,8 @@ def training_figure(
         panels["greedy: violating samples %"] = lambda axes: _course(
             axes, share[0], 100 * share[1], LEARNED_COLOR, least=1.0
         )
-    if error[0].size > 1:  # a single one makes no curve
+    # A single error makes no curve.
+    if error[0].size > 1:
         panels["TD error (r.m.s.)"] = lambda axes: _course(axes, *error, INK, least=1e-12)
     if moved:
         panels["change of θ, by its scale"] = lambda axes: _change(axes, log, moved)
@@ -136,7 +138,8 @@ def _course(
     axes: Axes, samples: Array, values: Array, color: str, least: float
 ) -> Sequence[EndLabel]:
     """A line from 0 to `least` or more, logarithmic where it spans decades; it has no name."""
-    axes.plot(samples, values, marker="." if len(values) < POINTS else "", color=color, **_LINE)
+    marker = "." if len(values) < POINTS else ""
+    axes.plot(samples, values, marker=marker, color=color, **_LINE)
     low = float(values.min())
     top = max(float(values.max()), least)
     short = EngFormatter(sep="") if top >= 1e3 else FormatStrFormatter("%g")
@@ -152,6 +155,7 @@ def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) ->
     """Norm of the increments of blocks of θ, each (K,)."""
     labels = []
     top = 0.0
+    # No more blocks are drawn than there are colours.
     for color, (name, norm) in zip(ENTRIES, moved.items(), strict=False):
         axes.plot(log["samples"], norm, color=color, linewidth=1.2)
         labels.append(EndLabel(symbol(name), float(norm[-1]), color))

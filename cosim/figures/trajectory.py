@@ -61,13 +61,18 @@ def trajectory_figure(
     cells: Any = []
     for row in range(rows):
         cells.append([names[row * len(names) // rows] for names in (left, right)])
-    with figure(max(1.05 * max(len(left), len(right) * 0.8), 2.4) + 0.5) as drawn:
+    # Panels on the right may be a little lower than those of the loop.
+    panel_rows = max(len(left), len(right) * 0.8)
+    height = max(1.05 * panel_rows, 2.4) + 0.5
+    with figure(height) as drawn:
         panels = drawn.subplot_mosaic(cells, sharex=True, width_ratios=(1.35, 1.0))
         for name, axes in panels.items():
             axes.set_ylabel(label(name, trajectory.signals[name].unit), fontsize=7.0)
             for run in beside:
                 values = run[name]
-                axes.update_datalim([(time[0], np.min(values)), (time[0], np.max(values))])
+                lowest = (time[0], np.min(values))
+                highest = (time[0], np.max(values))
+                axes.update_datalim([lowest, highest])
                 axes.autoscale_view()
         _loop_panels(panels, time, trajectory, scenario)
         for name in right:
@@ -78,6 +83,7 @@ def trajectory_figure(
         panels["penalty"].set_ylim(bottom=0.0)
         for names in (left, right):
             panels[names[-1]].set_xlabel(f"time [{unit}]")
+        # The last input is held for a sample more.
         last_step = time[1] - time[0] if len(time) > 1 else 1.0
         panels[left[0]].set_xlim(time[0], time[-1] + last_step)
         drawn.align_ylabels()
@@ -205,11 +211,15 @@ def animation(
     for title, run in runs.items():
         drawn = overlay_figure({start: first, name: run})
         for axes, signal in zip(drawn.axes, first.scenario.limits, strict=True):
-            values = np.concatenate([first[signal], *(frame[signal] for frame in runs.values())])
-            _fix_ordinate(axes, values)
+            # All frames have one ordinate, so that the lines alone move.
+            values_of_all = [first[signal]]
+            for frame in runs.values():
+                values_of_all.append(frame[signal])
+            _fix_ordinate(axes, np.concatenate(values_of_all))
         drawn.axes[0].set_title(title, loc="right", fontsize=8.5, pad=16.0)
         images.append(Image.fromarray(_pixels(drawn)))
     durations = [FRAME] * len(images)
+    # The last frame stays, before the animation begins again.
     durations[-1] = 6 * FRAME
     content = BytesIO()
     images[0].save(

@@ -48,7 +48,8 @@ ALONE = ("states", "actions", "sensors", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
 HELD = ("actions", "disturbances")
 FREE = (-inf, inf)
-_STATUS_ENTITY, _RESIDUAL = "solver/status", "solver/log_residual"
+_STATUS_ENTITY = "solver/status"
+_RESIDUAL = "solver/log_residual"
 _GOOD = "#3A9A5B"
 
 
@@ -194,7 +195,8 @@ class RerunRecorder:
         moments, *states = np.array(self._within).T
         self._within.clear()
         # A state at the end of a sample counts to that sample.
-        sample = np.maximum(np.searchsorted(time, moments) - 1, 0)
+        next_sample = np.searchsorted(time, moments)
+        sample = np.maximum(next_sample - 1, 0)
         rows = times(samples[sample], moments)
         for channel, values in zip(self._fine, states, strict=True):
             stream.send([channel], rows, values)
@@ -505,7 +507,8 @@ class Stream:
         properties: Mapping[str, object] = MappingProxyType({}),
         layout: rrb.Blueprint | None = None,
     ) -> None:
-        self.path, self.layout = check_target(path), layout
+        self.path = check_target(path)
+        self.layout = layout
         name_of_partial = f".{self.path.stem}.{secrets.token_hex(4)}.partial.rrd"
         self._partial = self.path.with_name(name_of_partial)
         self._partial.touch()
@@ -684,23 +687,31 @@ def view(
         along: the horizontal axis.
         legend: whether it is drawn; by default where there are several signals.
     """
-    lows, highs = [], []
+    lows = []
+    highs = []
     for channel in channels:
-        if window := channel.window():
-            lows.append(window[0])
-            highs.append(window[1])
+        window = channel.window()
+        # A channel without values has no say in the range.
+        if window is None:
+            continue
+        low, high = window
+        lows.append(low)
+        highs.append(high)
     contents = []
     for entity in dict.fromkeys(channel.entity for channel in channels):
         contents += [f"/{entity}", f"/bounds/{entity}/**"]
+    ordinate = None
+    if lows:
+        ordinate = rrb.ScalarAxis(range=(min(lows), max(highs)))
+    if legend is None:
+        legend = len(channels) > 1
     return rrb.TimeSeriesView(
         name=drawable(title),
         origin="/",
         contents=contents,
         axis_x=along,
-        axis_y=rrb.ScalarAxis(range=(min(lows), max(highs))) if lows else None,
-        plot_legend=rrb.PlotLegend(
-            corner=rrb.Corner2D.RightTop, visible=len(channels) > 1 if legend is None else legend
-        ),
+        axis_y=ordinate,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
     )
 
 

@@ -91,11 +91,15 @@ def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
         log: rows (training_seed, samples, J, greedy_J); greedy_J is NaN between evaluations.
         best: J*; costs are then regrets in %.
     """
-    runs = [_points_of_a_run(rows) for _, rows in log.groupby("training_seed", sort=False)]
+    runs = []
+    for _, rows in log.groupby("training_seed", sort=False):
+        runs.append(_points_of_a_run(rows))
+    # A run that diverged has fewer points: those that did not set the axis.
     longest = max(runs, key=lambda points: points.shape[1])
     samples = longest[0]
-    training = np.array([_padded(points[1], len(samples)) for points in runs])
-    greedy = np.array([_padded(points[2], len(samples)) for points in runs])
+    n_points = len(samples)
+    training = np.array([_padded(points[1], n_points) for points in runs])
+    greedy = np.array([_padded(points[2], n_points) for points in runs])
     if best is not None:
         training = 100 * regrets(training, best)
         greedy = 100 * regrets(greedy, best)
@@ -367,11 +371,16 @@ def _training_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]
         if run.marks or kept is None or not (out / kept).is_file():
             continue
         log = read_table(out / kept)
-        if blocks := increments(log):
-            samples = log["samples"].to_numpy(float)
-            updates = log["updates"].to_numpy(float)
-            error = td_error_mean(samples, log["td_error"].to_numpy(float), updates)
-            yield f"parameters-{Path(kept).stem}", parameters_figure(samples, blocks, error)
+        blocks = increments(log)
+        # A log without θ has nothing to draw.
+        if not blocks:
+            continue
+        samples = log["samples"].to_numpy(float)
+        updates = log["updates"].to_numpy(float)
+        td_error = log["td_error"].to_numpy(float)
+        windowed_error = td_error_mean(samples, td_error, updates)
+        drawn = parameters_figure(samples, blocks, windowed_error)
+        yield f"parameters-{Path(kept).stem}", drawn
 
 
 def increments(log: pd.DataFrame) -> dict[str, Array]:
@@ -407,7 +416,8 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
     with style.figure(2.9, 4.6) as drawn:
         axes = drawn.subplots()
         for case, values in samples.items():
-            share = 100 * float(np.mean(bound - values > VIOLATING))
+            violates = bound - values > VIOLATING
+            share = 100 * float(np.mean(violates))
             counts = np.histogram(values, edges)[0]
             heights = counts / (len(values) * width)
             color = styles[case].color
@@ -418,10 +428,18 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
         axes.set_xlim(edges[0], edges[-1])
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel(style.label(name, unit))
-        inverse = f"1/({unit})" if "/" in unit else f"1/{unit}"
-        axes.set_ylabel("density" if unit in ("", "1") else f"density [{inverse}]")
+        axes.set_ylabel(_density_label(unit))
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.2)
     return drawn
+
+
+def _density_label(unit: str) -> str:
+    """Label of a density over a quantity with a unit."""
+    if unit in ("", "1"):
+        return "density"
+    # Without brackets 1/kg/min would read as a division by both.
+    inverse = f"1/({unit})" if "/" in unit else f"1/{unit}"
+    return f"density [{inverse}]"
 
 
 def _common_bins(samples: Sequence[Array], bound: float) -> tuple[Array, float]:
@@ -464,11 +482,10 @@ def phase_figure(
     x = np.linspace(low[0], high[0], GRID)
     y = np.linspace(low[1], high[1], GRID)
     fields = {case: _field(policy, x, y, scenario) for case, policy in policies.items()}
-    # Arrows of all panels have one scale.
-    longest = 0.0
-    for field in fields.values():
-        lengths = np.hypot(field[..., 0], field[..., 1])
-        longest = max(longest, float(np.nanmax(lengths)))
+    # Arrows of all panels have one scale, so that policies can be compared.
+    longest = _longest_arrow(list(fields.values()))
+    # Policies that stay at the operating point have no arrows to scale.
+    arrow_scale = longest or 1.0
     columns = 2 if len(runs) == 4 else min(len(runs), 3)
     rows = -(-len(runs) // columns)
     # The axes reach half a cell beyond the outermost arrows.
@@ -476,14 +493,25 @@ def phase_figure(
     half_y = 0.5 * (y[1] - y[0])
     extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
     signals = next(iter(runs.values())).signals
-    with style.figure(7.0 / columns * rows + 0.4, style.WIDTH if columns > 1 else 4.2) as drawn:
+    operating_point = scenario.reference_state[:2]
+    height = 7.0 / columns * rows + 0.4
+    width = style.WIDTH if columns > 1 else 4.2
+    with style.figure(height, width) as drawn:
         grid = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(runs) :]:
             axes.set_visible(False)
         for axes, (case, run) in zip(grid.flat, runs.items(), strict=False):
             _draw_density(axes, run.states[:, :2], extent)
-            _draw_arrows(axes, x, y, fields[case] / (longest or 1.0))
-            axes.plot(*scenario.reference_state[:2], "+", color=BOUND, ms=9, mew=1.6, zorder=5)
+            _draw_arrows(axes, x, y, fields[case] / arrow_scale)
+            axes.plot(
+                operating_point[0],
+                operating_point[1],
+                "+",
+                color=BOUND,
+                markersize=9,
+                markeredgewidth=1.6,
+                zorder=5,
+            )
             _draw_bounds(axes, scenario)
             axes.set_title(shown_case(case))
             axes.set_xlim(extent[:2])
@@ -501,6 +529,15 @@ def phase_figure(
             fontsize=7.0,
         )
     return drawn
+
+
+def _longest_arrow(fields: Sequence[Array]) -> float:
+    """Largest length in fields (Y, X, 2); an action that is NaN has none."""
+    longest = 0.0
+    for field in fields:
+        lengths = np.hypot(field[..., 0], field[..., 1])
+        longest = max(longest, float(np.nanmax(lengths)))
+    return longest
 
 
 def _draw_bounds(axes: Axes, scenario: Scenario) -> None:
@@ -523,19 +560,22 @@ def _field(policy: Policy, x: Array, y: Array, scenario: Scenario) -> Array:
     Returns:
         The field, (Y, X, 2).
     """
+    # Inputs of unlike units become comparable as shares of their range.
     input_range = scenario.action_upper - scenario.action_lower
     actions = np.empty((len(y), len(x), 2))
     for row, second in enumerate(y):
         for column, first in enumerate(x):
             state = np.array([first, second])
             actions[row, column] = policy(state)[:2]
-    field: Array = (actions - scenario.reference_action[:2]) / input_range[:2]
+    from_operating_point = actions - scenario.reference_action[:2]
+    field: Array = from_operating_point / input_range[:2]
     return field
 
 
 def _draw_arrows(axes: Axes, x: Array, y: Array, field: Array) -> None:
     """Draw a field (Y, X, 2) on a grid as arrows, whose length goes with the root of its size."""
     size = np.hypot(field[..., 0], field[..., 1])
+    # Divided by the root of its size: else small arrows could not be seen beside large ones.
     shrink = 1.0 / np.sqrt(np.where(size > 0, size, 1.0))
     axes.quiver(
         *np.meshgrid(x, y),

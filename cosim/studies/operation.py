@@ -71,6 +71,7 @@ def optimum_at(scenario: Scenario, sample: int) -> Controller:
     if fouling(scenario) is None:
         return build_controller("optimal", plant_at(scenario, time))
     moving = QuasiStaticPolicy.from_scenario(scenario)
+    # The plant stands still from here on: its position no longer depends on the time.
     where = moving.law.position(time)
     law = replace(moving.law, position=lambda _: where)
     return QuasiStaticPolicy(law, moving.policies, scenario.sampling_time)
@@ -123,7 +124,8 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
                 violating[k] = float(penalty.violation(loop.s).sum()) > VIOLATING
                 try:
                     cost[k], update = loop.advance()
-                    updates += update is not None
+                    if update is not None:
+                        updates += 1
                     if not first_change and not np.array_equal(start_theta, loop.controller.theta):
                         first_change = k + 1
                 except DivergenceError as error:

@@ -772,8 +772,9 @@ def _gains_over_baselines(
     """
     naive, tuned = bases
     cost = indicators["J"].mean(axis=1)
+    by_cost = np.argsort(cost, kind="stable")
     # Of an even number the lower one of both middle runs.
-    middle = np.argsort(cost, kind="stable")[(len(cost) - 1) // 2]
+    middle = by_cost[(len(cost) - 1) // 2]
     ratio = tuned["J"].mean() / naive["J"].mean()
     cells = [f"{ratio:.3f}", shown(float(cost[middle]), digits=6)]
     for name in ("J", "economic_cost"):
@@ -815,6 +816,7 @@ def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
     for store in stores:
         run = store.run
         key = {"scenario": run.scenario.name, "case": run.case, "training_seed": run.seed}
+        # A controller is not trained, and has no status of its own.
         state = {
             "status": store.status or "evaluated",
             "samples": int(store.about.get("samples", 0)),
@@ -828,6 +830,7 @@ def _measured(stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
                 parts[OPERATION].append(log)
         online = []
         for file, noise in run.noise.items():
+            # A trajectory is kept as a file, not as rows of a table.
             if noise.whole:
                 continue
             rows = store.measured(file).rename_axis("seed").reset_index()

@@ -420,7 +420,8 @@ class RunStore:
         """Content of a file by noise seed, of runs as long as the plan's; {} of a damaged one."""
         if file in self._measured:
             return self._measured[file]
-        path, noise = self.folder / file, self._noise(file)
+        path = self.folder / file
+        noise = self._noise(file)
         measured: dict[int, dict[str, Any]] = {}
         self._measured[file] = measured
         if path.is_file():
@@ -430,7 +431,9 @@ class RunStore:
             except StudyError:
                 self.remarks.append(f"'{path}' is damaged; made anew")
                 return measured
-            rows = rows[(rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)]
+            # Rows of an earlier study in this folder may be of runs of another length.
+            same_length = (rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)
+            rows = rows[same_length]
             rows = rows[~rows.index.duplicated()].drop(columns=["steps", "burn_in"])
             measured.update(rows.to_dict("index"))
         return measured
@@ -563,7 +566,10 @@ class RunStore:
             return
         self.flush()
         # Times differ from run to run: they are no result.
-        hashes = {path.name: file_hash(path) for path in self._files() if path.name != TIMING}
+        hashes = {}
+        for path in self._files():
+            if path.name != TIMING:
+                hashes[path.name] = file_hash(path)
         if self.about.get("files") != hashes:
             self._note(files=hashes)
 
@@ -600,8 +606,10 @@ class Runner:
     def __init__(self, runs: list[Run], out: Path, report: Progress):
         self._report = report
         by_folder: dict[str, Run] = {}
-        for run in runs:  # upper and lower case are equal on some systems
-            other = by_folder.setdefault(str(run.folder).lower(), run)
+        for run in runs:
+            # Upper and lower case are equal on some systems.
+            folder = str(run.folder).lower()
+            other = by_folder.setdefault(folder, run)
             if other is not run:
                 raise StudyError(f"'{run}' and '{other}' would have one folder; rename one of them")
         self.stores = {str(run): RunStore(out, run) for run in runs}
@@ -676,7 +684,8 @@ class Runner:
         state = f"{complete}/{len(self.stores)} runs"
         if self.failures:
             state += f", {len(self.failures)} failed"
-        self._report(sum(store.done for store in self.stores.values()), state, line)
+        samples_done = sum(store.done for store in self.stores.values())
+        self._report(samples_done, state, line)
 
 
 def _end_of_run(name: str, store: RunStore) -> str:

@@ -124,6 +124,11 @@ def _explain(algorithm: str, hyperparameters: Sequence[Hyperparameter], output: 
     output.json(document)
 
 
+def _or_none(value: float | None) -> str:
+    """A figure of the summary, which a rule need not have."""
+    return "none" if value is None else f"{value:.6g}"
+
+
 def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
     from cosim.core.statistics import shown
 
@@ -136,6 +141,10 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
         ("J of the learned θ, on the same", shown(summary["J"], digits=6)),
         ("difference", shown(summary["difference"], summary["difference_interval"], 1, 3)),
         ("updates", str(summary["updates"])),
+        ("changes of the plant detected", _or_none(summary["changes"])),
+        ("retreats", str(summary["retreats"])),
+        ("cost that the rule predicted", _or_none(summary["predicted_cost"])),
+        ("cost since the last update", _or_none(summary["realised_cost"])),
         ("economic cost", shown(summary["economic_cost"], digits=6)),
         ("mean violation", f"{summary['mean_violation']:.6f}"),
         ("violating share", f"{100 * summary['violating_share']:.2f} %"),

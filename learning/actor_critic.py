@@ -272,6 +272,17 @@ class ActorCritic(Algorithm):
         weights: Vector = np.linalg.solve(scaled, variance * self._moment)
         return weights
 
+    def retreat(self) -> None:
+        """Begin a batch at the θ to which the loop has gone back.
+
+        Critic and advantage were of the policy that was left. Errors of prediction are the plant's,
+        and stay; the step is from the controller's θ in any case.
+        """
+        self._filled = 0
+        self._critic.forget(0.0)
+        self._information = np.zeros_like(self._information)
+        self._moment = np.zeros_like(self._moment)
+
     def state_dict(self) -> State:
         """The open batch, coordinates, prediction errors, and the sums of critic and advantage."""
         return {

@@ -112,7 +112,8 @@ class Algorithm:
     - `explores`, bool: whether the samples explore now; they do where it is not there.
     - `retreat()`: called where the loop has set θ back; the rule goes on from that.
     - `watch(transition)`: called in place of `observe` while θ stays after a retreat.
-    - `predicted_cost`, float: what θ is expected to cost on average, if that is known.
+    - `predicted_cost`, float: what θ is expected to cost on average, NaN where that is unknown.
+    - `changes`, int: how often the rule has detected that the plant is another one.
     - `failed(cost) -> Update | None`: called in place of `observe` on a sample at which the
       controller failed, with the sample's share of J.
 

@@ -182,6 +182,11 @@ class ModelBased(Algorithm):
         """Samples of the model that its rollouts have taken so far."""
 
     @property
+    def changes(self) -> int:
+        """How often the plant was taken for another one."""
+        return self._data.changes
+
+    @property
     def explores(self) -> bool:
         """Whether the samples explore now."""
         return self._data.count < self.configuration.exploration_samples

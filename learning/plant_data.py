@@ -44,6 +44,7 @@ class PlantData:
     Attributes:
         count: samples so far.
         regime_start: samples before the present regime.
+        changes: regimes before it.
         count_at_fit: samples at the last fit.
     """
 
@@ -53,6 +54,7 @@ class PlantData:
         self.model: EmpiricalModel | None = None
         self.count = 0
         self.regime_start = 0
+        self.changes = 0
         self.count_at_fit = 0
         # A ring of transitions (s, a, s₊, ℓ).
         self._rows = np.zeros((settings.memory, features.n_inputs + features.n_outputs))
@@ -197,6 +199,7 @@ class PlantData:
                 limit = self.settings.suspicion_probability
             if probability < limit:
                 # Samples before the window are of another plant; its residuals are kept.
+                self.changes += 1
                 self.regime_start = self.count - window
                 latest = model.residuals[-self.settings.earlier_residuals :]
                 self._earlier = replace(model, residuals=latest)
@@ -209,6 +212,7 @@ class PlantData:
             "rows": self._rows,
             "count": self.count,
             "regime_start": self.regime_start,
+            "changes": self.changes,
             "count_at_fit": self.count_at_fit,
         }
         for name, model in (("model", self.model), ("earlier", self._earlier)):
@@ -221,6 +225,7 @@ class PlantData:
         self._rows = state["rows"]
         self.count = state["count"]
         self.regime_start = state["regime_start"]
+        self.changes = state["changes"]
         self.count_at_fit = state["count_at_fit"]
         self._blocks = []
         # Before the first fit there is no model, before the first change no earlier one.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from importlib.metadata import version
-from math import inf, isfinite, isnan
+from math import inf, isfinite, isnan, nan
 from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -77,6 +77,10 @@ class Training(Result):
         start: the first θ.
         start_J: its greedy J on that noise.
         baselines: J of `naive` and, where known, `optimal` on the same noise.
+        predicted_cost: what the rule expects θ to cost, mean per sample; NaN of a rule without a
+            prediction.
+        changes: how often the rule has detected that the plant is another one; None where it does
+            not look for that.
         functions: whether the controller's were `interpreted` or `compiled`.
         without_checkpoint: why a checkpoint is missing.
         wall_seconds: the time that it took.
@@ -92,6 +96,8 @@ class Training(Result):
     start: Parameters
     start_J: float
     baselines: Mapping[str, float]
+    predicted_cost: float = float("nan")
+    changes: int | None = None
     functions: str | None = None
     without_checkpoint: str | None = None
     wall_seconds: float = field(default=float("nan"), compare=False)
@@ -110,6 +116,9 @@ class Training(Result):
             "difference": shown(*self.difference, digits=3),
             "verdict": self.verdict,
             "updates": self.updates,
+            "predicted cost": self.predicted_cost,
+            "realised cost": self.realised_cost,
+            "changes detected": self.changes,
             "retreats": self.retreats,
             "regret": self.regret,
         }
@@ -165,6 +174,22 @@ class Training(Result):
                 evaluations += 1
                 theta = row.parameters.theta
         return evaluations * run.evaluation_seeds * run.evaluation_steps
+
+    @property
+    def realised_cost(self) -> float:
+        """Mean cost per sample of the training itself since the last update.
+
+        Of whole intervals of the log; NaN where the last one has an update.
+        """
+        total = 0.0
+        count = 0.0
+        for row, before in zip(self.rows[:0:-1], self.rows[-2::-1], strict=True):
+            if row["updates"]:
+                break
+            samples = row["samples"] - before["samples"]
+            total += samples * row["J"]
+            count += samples
+        return total / count if count else float("nan")
 
     @property
     def regret(self) -> float:
@@ -283,6 +308,9 @@ class Training(Result):
             "hyperparameters": run.configuration.model_dump(mode="json"),
             "verdict": self.verdict,
             "updates": self.updates,
+            "predicted_cost": _known(self.predicted_cost),
+            "realised_cost": _known(self.realised_cost),
+            "changes": self.changes,
             "retreats": self.retreats,
             "parameters_hash": self.parameters.hash,
             "evaluation_seeds": run.evaluation_seeds,
@@ -423,6 +451,8 @@ def run_training(
             start=session.start,
             start_J=evaluator.start["J"],
             baselines=evaluator.baselines,
+            predicted_cost=float(getattr(session.loop.algorithm, "predicted_cost", nan)),
+            changes=getattr(session.loop.algorithm, "changes", None),
             functions=functions_of(session.loop.controller),
             without_checkpoint=session.without_checkpoint,
             wall_seconds=time.perf_counter() - clock,
@@ -636,6 +666,11 @@ def _greedy(evaluation: Mapping[str, Any]) -> dict[str, float]:
         known = evaluation[name] is not None
         columns[name] = evaluation[name] if known else float("nan")
     return columns
+
+
+def _known(value: float) -> float | None:
+    """A number for a JSON document, None where it is not known."""
+    return value if isfinite(value) else None
 
 
 def _total(values: Iterable[float]) -> float:

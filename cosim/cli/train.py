@@ -129,6 +129,11 @@ def _explain(algorithm: str, hyperparameters: Sequence[Hyperparameter], output: 
     output.json(document)
 
 
+def _or_none(value: float | None) -> str:
+    """A figure of the summary, which a rule need not have."""
+    return "none" if value is None else f"{value:.6g}"
+
+
 def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
     from cosim.core.statistics import shown
 
@@ -149,6 +154,10 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
         ]
     rows += [
         ("updates", str(summary["updates"])),
+        ("changes of the plant detected", _or_none(summary["changes"])),
+        ("retreats", str(summary["retreats"])),
+        ("cost that the rule predicted", _or_none(summary["predicted_cost"])),
+        ("cost since the last update", _or_none(summary["realised_cost"])),
         ("plant samples", str(summary["plant_samples"])),
         ("plant samples of held-out runs, beside", str(summary["held_out_samples"])),
     ]

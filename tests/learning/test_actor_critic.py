@@ -94,6 +94,31 @@ def test_a_smaller_radius_makes_a_smaller_change_of_the_action(linear_quadratic)
     assert 1e-4 < change <= 1e-3 * (1 + 1e-9)
 
 
+def test_after_a_retreat_a_batch_is_judged_as_if_it_were_the_first(linear_quadratic):
+    """What was seen at the θ that was left, in whole batches and in an open one, has no part."""
+    size = 200
+    # Short steps, after which the critic would go on knowing what it knew.
+    settings = {"exploration_probability": 0.5, "decay_after": 1}
+    loop, _ = one_batch(linear_quadratic, size=size, **settings)
+    rule = loop.algorithm
+    for _ in range(size // 2):
+        loop.advance()
+    kept = linear_quadratic.wrong().theta
+    loop.controller.theta = kept
+    rule.retreat()
+    loop.renew()
+    moved_at = []
+    for number in range(1, size + 1):
+        if loop.advance()[1] is not None:
+            moved_at.append(number)
+    assert moved_at == [size], "the open batch has begun anew"
+    td_errors = rule.kept[3]
+    # LSTD with the mean cost as its constant: of one batch alone the errors' mean is zero.
+    assert td_errors.mean() == pytest.approx(0.0, abs=1e-6 * np.abs(td_errors).max())
+    step = (loop.controller.theta - kept) / rule._step.scale
+    assert 0 < np.linalg.norm(step) <= rule.configuration.largest_step * (1 + 1e-9)
+
+
 class Solution:
     def __init__(self, action, size):
         self.action, self.policy_jacobian = action, np.zeros((2, size))

@@ -137,6 +137,30 @@ def test_a_theta_that_stays_shows_no_difference(scenario):
     assert result.updates == 0
 
 
+class Predicting(QLearning):
+    """Moves θ once, and knows what it will cost and that the plant has changed."""
+
+    predicted_cost = 6543.0
+    changes = 2
+
+    def observe(self, sample):
+        if sample.number != 60:
+            return None
+        return Update(td_error=0.0, step=0.0, smallest_eigenvalue=1.0)
+
+
+def test_the_summary_sets_the_predicted_cost_beside_the_realised_one(scenario):
+    run = make_run(scenario, "q-learning", samples=180)
+    result = run_training(run, rule=Predicting)
+    summary = result.summary()
+    assert (summary["predicted_cost"], summary["changes"]) == (6543.0, 2)
+    # The update is in the second row of 50 samples; a third and 30 samples come after it.
+    after = [row for row in result.rows if row["samples"] > 100]
+    realised = (50 * after[0]["J"] + 30 * after[1]["J"]) / 80
+    assert summary["realised_cost"] == pytest.approx(realised)
+    assert (summary["updates"], summary["retreats"]) == (1, 0)
+
+
 class Trying(QLearning):
     """Hands over its start while the controller carries a candidate without any back-off."""
 

@@ -38,6 +38,8 @@ def test_train_writes_theta_log_summary_and_recording(trained):
     assert summary["regret"] is not None, "the optimum need not be named"
     assert summary["difference"] == pytest.approx(summary["J"] - summary["start_J"])
     assert (summary["verdict"], summary["updates"]) == ("no difference shown", 10)
+    nothing = ("predicted_cost", "realised_cost", "changes")
+    assert [summary[name] for name in nothing] == [None] * 3, "updated until its last sample"
     log = (folder / "learning.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in log] == ["samples", "0", "50", "100", "150", "200"]
     assert (folder / "training.rrd").stat().st_size > 10_000

@@ -17,7 +17,7 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
-from controllers.errors import ControllerError
+from controllers.errors import ControllerError, ModelWarning, warn
 from cosim.core.files import cache_folder, lock, temporary_folder
 from cosim.core.processes import child_process
 from cosim.core.protocols import Matrix, Vector
@@ -288,7 +288,9 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
     results. Of others every `*.c` is given to the compiler, and the other files are included. It is
     the same file for the same content, compiler and flags, it appears whole, and of several
     processes one makes it. None where there is no compiler, where it fails, and where COSIM_COMPILE
-    says `never`; ControllerError on a word that it does not know.
+    says `never`; ControllerError on a word that it does not know. A compiler that fails or takes
+    longer than PATIENCE is a ModelWarning, and is not tried again on the same files: a note in the
+    cache, which the warning names, says why.
     """
     if switch() == "never":
         return None
@@ -306,13 +308,27 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
     try:
         # Any number of processes may ask for the same library at once: `_make` locks.
         path = cache_folder("compiled") / f"{build_name(files, system)}.lib"
-        if not path.is_file():
+        note = path.with_suffix(".failed")
+        if not path.is_file() and not note.is_file():
             _make(path, files, compiler, stored)
+        if not path.is_file():
+            if note.is_file():
+                _warn_of_failure(note)
+            return None
         # A cache that is cleaned by age keeps what is in use.
         os.utime(path)
     except OSError:
         return None
-    return path if path.is_file() else None
+    return path
+
+
+def _warn_of_failure(note: Path) -> None:
+    """Warn that a controller is interpreted, for the reason that the note has."""
+    reason = note.read_text(encoding="utf-8")
+    warn(
+        f"not compiled but interpreted, which is slower: {reason}; remove {note} to try again",
+        ModelWarning,
+    )
 
 
 def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
@@ -337,17 +353,24 @@ def _make(
     compiler: str | None,
     stored: str,
 ) -> None:
-    """Take a library from `BUILDS`, else compile it; no file where neither can be."""
+    """Take a library from `BUILDS`, else compile it; a note where the compiler fails."""
+    note = path.with_suffix(".failed")
     with lock(path.with_suffix(".lock"), PATIENCE):
-        if path.is_file():
+        # Another process may have tried in the meantime.
+        if path.is_file() or note.is_file():
             return
         with temporary_folder(".partial-", path.parent) as folder:
             made = folder / "library"
             content = _stored_build(stored)
             if content is not None:
                 made.write_bytes(content)
-            elif compiler is None or not _compiled(compiler, files, folder):
+            elif compiler is None:
                 return
+            else:
+                reason = _compile(compiler, files, folder)
+                if reason is not None:
+                    note.write_text(reason, encoding="utf-8")
+                    return
             # The library appears whole, in one step, or not at all.
             made.replace(path)
 
@@ -364,20 +387,32 @@ def _stored_build(name: str) -> bytes | None:
         return None
 
 
-def _compiled(compiler: str, files: Mapping[str, bytes], folder: Path) -> bool:
-    """Compile the files to `library` in a folder; whether it is there."""
+def _compile(compiler: str, files: Mapping[str, bytes], folder: Path) -> str | None:
+    """Compile the files to `library` in a folder; the reason where the compiler does not.
+
+    Raises:
+        OSError: The files cannot be written or the compiler cannot be started, which is no fault of
+            the files'.
+    """
     for name, content in files.items():
         (folder / name).write_bytes(content)
     # The other files are headers, which the units include.
     units = sorted(name for name in files if name.endswith(".c"))
     command = [compiler, *FLAGS, "-o", "library", *units, "-lm"]
-    try:
-        # A compiler that hangs must not hang the run: without a library the interpreter does.
-        with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
+    # A compiler that hangs must not hang the run: without a library the interpreter does.
+    with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
+        try:
             status = child.wait(PATIENCE)
-    except (OSError, subprocess.SubprocessError):
-        return False
-    return status == 0 and (folder / "library").is_file()
+        except subprocess.TimeoutExpired:
+            return f"{compiler} took longer than {PATIENCE:g} s"
+    if status < 0:
+        # It was ended from outside, for want of memory say: another time it may succeed.
+        raise OSError(f"{compiler} was ended by signal {-status}")
+    if status != 0:
+        return f"{compiler} failed with status {status}"
+    if not (folder / "library").is_file():
+        return f"{compiler} wrote no library"
+    return None
 
 
 def switch() -> str:

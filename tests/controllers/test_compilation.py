@@ -5,11 +5,13 @@ import io
 import shutil
 import sys
 import tarfile
+import warnings
 
 import pytest
 
 from benchmarks.builds import SYSTEMS, built, preset_sources
-from controllers import ControllerError, Parameters, RtiNmpc, functions
+from controllers import ControllerError, Parameters, RtiNmpc, errors, functions
+from controllers.errors import ModelWarning
 from controllers.factories import naive
 from controllers.functions import BUILDS, build_name, description, find_compiler, library
 from cosim import FmuPlant, Scenario, simulate
@@ -94,20 +96,40 @@ def test_a_stored_build_is_taken_where_there_is_a_compiler_too(folder, monkeypat
     monkeypatch.setattr(functions, "BUILDS", builds)
     monkeypatch.setenv("CC", FAILS)
     assert library(sources).read_bytes() == b"stored"
-    assert answer(8) is None
+    with pytest.warns(ModelWarning, match="failed"):
+        assert answer(8) is None
 
 
 @pytest.mark.slow
 def test_a_compiler_that_fails_or_hangs_leaves_nothing(folder, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", FAILS)
-    assert answer(42) is None
+    with pytest.warns(ModelWarning, match="failed with status 1"):
+        assert answer(42) is None
     hangs = tmp_path / "cc"
     hangs.write_text("#!/bin/sh\nsleep 600\n")
     hangs.chmod(0o700)
     monkeypatch.setenv("CC", str(hangs))
     monkeypatch.setattr(functions, "PATIENCE", 0.5)
-    assert answer(42) is None
+    with pytest.warns(ModelWarning, match=r"took longer than 0\.5 s"):
+        assert answer(42) is None
     assert list(folder.glob("*.lib")) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the compiler is a shell script")
+def test_a_compiler_that_failed_is_not_tried_again_on_the_same_files(folder, monkeypatch, tmp_path):
+    calls = tmp_path / "calls"
+    script = tmp_path / "cc"
+    script.write_text(f"#!/bin/sh\necho call >> {calls}\nexit 1\n")
+    script.chmod(0o700)
+    monkeypatch.setenv("CC", str(script))
+    for _ in range(2):
+        monkeypatch.setattr(errors, "_WARNED", {})  # as in another process
+        with pytest.warns(ModelWarning, match="interpreted"):
+            assert answer(44) is None
+    assert len(calls.read_text().splitlines()) == 1
+    with pytest.warns(ModelWarning):
+        assert answer(45) is None
+    assert len(calls.read_text().splitlines()) == 2
 
 
 @needs_compiler
@@ -127,7 +149,10 @@ def test_a_compiler_that_breaks_its_surroundings_is_survived(folder, monkeypatch
     script.chmod(0o700)
     with monkeypatch.context() as patched:
         patched.setenv("CC", str(script))
-        assert answer(42) is None
+        with warnings.catch_warnings():
+            # Where the cache itself was removed there is no note, and no warning.
+            warnings.simplefilter("ignore", ModelWarning)
+            assert answer(42) is None
     assert ctypes.CDLL(str(answer(42))).answer() == 42
 
 

@@ -275,7 +275,7 @@ class _Run:
                 raise
             self._keep(first, table)
             seconds = perf_counter() - begin
-            if end == next_report or end == self._steps or seconds > PART_SECONDS / 4:
+            if end in (next_report, self._steps) or seconds > PART_SECONDS / 4:
                 progress(end)
             if seconds > PART_SECONDS:
                 length = max(1, length // 2)

@@ -45,6 +45,14 @@ def test_the_covariance_solves_lyapunovs_equation():
     assert gamma == pytest.approx(PHI @ gamma @ PHI.T + SIGMA)
 
 
+def test_an_output_with_hardly_any_noise_has_its_covariance_too():
+    scale = np.diag([1.0, 1e-60])
+    phi = scale @ PHI @ np.linalg.inv(scale)
+    gamma = error_covariance(phi, scale @ SIGMA @ scale)
+    expected = scale @ error_covariance(PHI, SIGMA) @ scale
+    np.testing.assert_allclose(gamma, expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize("count", [1, 3, 40])
 def test_the_covariance_of_a_mean_is_the_sum_of_all_covariances(count):
     gamma = error_covariance(PHI, SIGMA)

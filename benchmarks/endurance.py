@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from contextlib import suppress
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
@@ -68,7 +69,9 @@ def endure(samples: int, folder: Path, *, log: bool = False) -> dict[str, object
         memory.append(resident())
         failures.append(0 if row is None else int(row["failures"]))
 
-    # What is loaded once is loaded first: SciPy's LAPACK comes with the first dπ/dθ.
+    # What is loaded once is loaded first: SciPy's LAPACK comes with the first dπ/dθ, its
+    # statistics with the first comparison of two shifts.
+    import_module("scipy.stats")
     build_controller("naive", scenario).feedback(scenario.initial_state).policy_jacobian  # noqa: B018
     look(0, None)
     result = run_training(run, folder, progress=look)

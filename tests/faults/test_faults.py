@@ -109,7 +109,8 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path):
 
 @pytest.mark.slow
 def test_too_few_files_that_may_be_open_are_one_line(tmp_path):
-    words = ["evaluate", "--seeds", "2", "--steps", "20", "--jobs", "2", "--out", "out"]
+    # So much work that workers are started.
+    words = ["evaluate", "--seeds", "9", "--steps", "90000", "--jobs", "2", "--out", "out"]
     root = str(Path(__file__).parents[2])
     few = lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (16, 16))  # noqa: E731
     done = run_cosim(*words, folder=tmp_path, env={"PYTHONPATH": root}, preexec_fn=few)

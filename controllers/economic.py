@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import null_space, solve_discrete_are, solve_discrete_lyapunov
 
-from controllers.errors import TuningError
+from controllers.errors import TuningError, TuningWarning, warn
 from controllers.model import discretise, runge_kutta
-from controllers.problem import Problem
+from controllers.problem import Problem, Scale
 from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
 from cosim.core.protocols import Array
 
@@ -24,6 +24,14 @@ FORCE_WEIGHT = 1e-3
 """Price ρ of the force F at the active constraints, against the conditioning β."""
 STRICTLY_ACTIVE = 1e-6
 """Share of the largest multiplier above which a bound counts as strictly active."""
+UNIT_WORDS = {"%": "per cent", "1": "unit", "": "unit"}
+"""Units that are not read aloud as they are written."""
+LEAST_CURVATURE = 1e-2
+"""Least curvature of a cost with an added quadratic, as a share of the economic cost's own size."""
+LARGEST_CURVATURE = 1e4
+"""Largest curvature that the least added quadratic may rely on, as a multiple of that size."""
+NOTHING_ADDED = 1e-7
+"""An addition below this share of that size is the solver's rounding, and none is made."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,8 @@ class SteadyState:
     `x` (n,), `u` (m,), `cost` ℓ_s; `costate` λ (n,) of f(x, u) − x = 0; `multipliers` (n+m,) of the
     bounds of w = (x, u), positive at a lower and negative at an upper bound, are the gradient of
     ℓ + λᵀ(f − x); `A` (n, n), `B` (n, m) Jacobians of f; `hessian` H = ∇²_w (ℓ + λᵀf) (n+m, n+m);
-    `C` (n_c, n+m) gradients of the strictly active bounds, `active` these in words.
+    `C` (n_c, n+m) gradients of the strictly active bounds, `active` these in words, `units` the
+    units of w.
     """
 
     x: Array
@@ -46,6 +55,17 @@ class SteadyState:
     hessian: Array
     C: Array
     active: tuple[str, ...]
+    units: tuple[str, ...]
+
+    def prices(self) -> tuple[str, ...]:
+        """What each active bound costs: its multiplier, the cost of a sample by a unit of it."""
+        sentences = []
+        multipliers = np.abs(self.C @ self.multipliers)
+        for row, bound, multiplier in zip(self.C, self.active, multipliers, strict=True):
+            unit = self.units[int(np.argmax(row))]
+            word = UNIT_WORDS.get(unit, unit)
+            sentences.append(f"{bound} costs {multiplier:.3g} a {word}, each sample")
+        return tuple(sentences)
 
     def __str__(self) -> str:
         return (
@@ -124,6 +144,7 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         hessian=hessian,
         C=np.eye(len(point))[strict],
         active=tuple(active),
+        units=tuple(quantity.unit for quantity in (*model.states, *model.actions)),
     )
 
 
@@ -269,6 +290,7 @@ def convexify(
     B: Array,
     H: Array,
     C: Array,
+    alpha: float | None = None,
 ) -> Convexification:
     """Best-conditioned convex stage cost with the same local optimum.
 
@@ -281,6 +303,7 @@ def convexify(
         B: Jacobian by the action, (n, m).
         H: Hessian of the stage cost, (n+m, n+m).
         C: Gradients of the active constraints, (n_c, n+m).
+        alpha: α, where it is not to be chosen.
 
     Raises:
         TuningError: There is no solution: the steady state is not locally optimal under these
@@ -328,6 +351,12 @@ def convexify(
         clarabel.PSDTriangleConeT(size),
         clarabel.PSDTriangleConeT(size),
     ]
+    if alpha is not None:
+        fixed = np.zeros((1, n_variables))
+        fixed[0, 0] = 1.0
+        constraints = np.vstack([constraints, fixed])
+        offset = np.append(offset, alpha)
+        cones.append(clarabel.ZeroConeT(1))
     z, status = solve_conic(quadratic, objective, constraints, offset, cones, iterations=500)
     if z is None or not z[0] > 0:
         constraint = "constraint" if n_c == 1 else "constraints"
@@ -356,12 +385,239 @@ def _symmetric_basis(size: int) -> list[Array]:
     return [symmetric_matrix(unit, size) for unit in np.eye(n_entries)]
 
 
+def least_addition(
+    A: Array,
+    B: Array,
+    H: Array,
+    C: Array,
+    least: float,
+    largest: float,
+) -> float:
+    """Least σ ≥ 0 for which H + σI has a convex stage cost with the same local optimum.
+
+    It is min σ s.t. `largest` I ⪰ H + σI + 𝓗(δP) + CᵀFC ⪰ `least` I over σ, δP and F: the
+    constraints of `convexify`, with a slack.
+
+    Args:
+        A: Jacobian of the next state by the state, (n, n).
+        B: Jacobian by the action, (n, m).
+        H: Hessian of the stage cost, (n+m, n+m), in variables of comparable size.
+        C: Gradients of the active constraints, (n_c, n+m).
+        least: Least curvature of the convex cost.
+        largest: Its largest curvature.
+
+    Raises:
+        TuningError: Clarabel finds none.
+    """
+    size = len(H)
+    identity = np.eye(size)
+    rotations = [rotation(A, B, unit) for unit in _symmetric_basis(len(A))]
+    forces = [C.T @ unit @ C for unit in _symmetric_basis(len(C))]
+    terms = [identity, *rotations, *forces]
+    columns = np.stack([svec(term) for term in terms], axis=1)
+    n_variables = columns.shape[1]
+    objective = np.zeros(n_variables)
+    objective[0] = 1.0
+
+    # σ ≥ 0, Hessian − least I ⪰ 0, largest I − Hessian ⪰ 0.
+    nonnegative = np.zeros((1, n_variables))
+    nonnegative[0, 0] = -1.0
+    constraints = np.vstack([nonnegative, -columns, columns])
+    above = svec(H - least * identity)
+    below = svec(largest * identity - H)
+    offset = np.concatenate([np.zeros(1), above, below])
+    cones = [
+        clarabel.NonnegativeConeT(1),
+        clarabel.PSDTriangleConeT(size),
+        clarabel.PSDTriangleConeT(size),
+    ]
+    quadratic = np.zeros((n_variables, n_variables))
+    z, status = solve_conic(quadratic, objective, constraints, offset, cones, iterations=500)
+    if z is None:
+        raise TuningError(f"the least added quadratic was not found (Clarabel: {status})")
+    return max(float(z[0]), 0.0)
+
+
+@dataclass(frozen=True)
+class Addition:
+    """The quadratic that the tuning adds to an economic cost that has no convex equal.
+
+    It is ½ `size` Σ (Δw_i / `ranges`_i)², with Δw = (x, u) less the optimal steady state: zero at
+    that state, so that this stays the optimum.
+
+    Attributes:
+        size: σ, in units of the cost.
+        ranges: Ranges of (x, u), (n+m,).
+        constraints: Gradients of the active bounds that the local feedback keeps, (n_c, n+m).
+        released: The other active bounds, in words: no stable local feedback can keep them, too.
+            Nothing pushes onto them: they are set-points, and their price is left out.
+        reason: Why the economic cost could not be used as it is.
+    """
+
+    size: float
+    ranges: Array
+    constraints: Array
+    released: tuple[str, ...]
+    reason: str
+
+    @property
+    def hessian(self) -> Array:
+        """Hessian of the added quadratic, (n+m, n+m)."""
+        return np.diag(self.size / self.ranges**2)
+
+    @property
+    def cost_of_a_tenth(self) -> float:
+        """Added cost of a sample in which one variable is a tenth of its range away."""
+        return 0.5 * self.size * 0.1**2
+
+    def __str__(self) -> str:
+        if not self.size:
+            text = (
+                "nothing had to be added: the steady state is a vertex or the cost is flat there, "
+                "and the size of the convex cost, which nothing determines, was chosen"
+            )
+        else:
+            text = (
+                "a quadratic was added: a deviation by a tenth of a range is given a cost of "
+                f"{self.cost_of_a_tenth:.3g} a sample. The steady state stays; the way back to it "
+                "is not the cheapest one"
+            )
+        if self.released:
+            text += (
+                f". No stable feedback stays on {', '.join(self.released)}: a set-point stands for "
+                "it, and its price is left out"
+            )
+        return text
+
+
+@dataclass(frozen=True)
+class LocalTuning:
+    """What the tuning makes of a steady state: a convex stage cost, its value and feedback.
+
+    Attributes:
+        convexification: The convex stage cost.
+        constraints: Gradients of the active bounds that are kept, (n_c, n+m).
+        economic: Feedback gain (m, n) of the economic cost, with what was added to it.
+        tuned: Feedback gain (m, n) of the convex one.
+        value: P (n, n), Hessian of the convex cost's value under γ = 1.
+        addition: What was added; None where nothing was.
+    """
+
+    convexification: Convexification
+    constraints: Array
+    economic: Array
+    tuned: Array
+    value: Array
+    addition: Addition | None
+
+
+def _scaled_cost(steady: SteadyState, ranges: Array) -> tuple[Array, float]:
+    """Hessian (n+m, n+m) of the economic cost in w_i / range_i, and the size of the cost there.
+
+    The size is that of the gradient, which is all that a linear cost has, or of the curvature.
+    """
+    H = steady.hessian * np.outer(ranges, ranges)
+    drift = np.hstack([steady.A - np.eye(len(steady.x)), steady.B])
+    gradient = steady.multipliers - drift.T @ steady.costate
+    size = max(np.abs(gradient * ranges).max(), np.abs(H).max())
+    return H, float(size) or 1.0
+
+
+def _local_tuning(steady: SteadyState) -> LocalTuning:
+    """The tuning of the economic cost as it is; TuningError where no convex cost is its equal."""
+    A = steady.A
+    B = steady.B
+    C = steady.C
+    # The economic cost's feedback is what the tuned one must equal: the certificate.
+    economic, _ = local_feedback(A, B, steady.hessian, C)
+    convex = convexify(A, B, steady.hessian, C)
+    tuned, P = local_feedback(A, B, convex.hessian, C)
+    return LocalTuning(convex, C, economic, tuned, P, None)
+
+
+def _augmented_tuning(problem: Problem, steady: SteadyState, reason: str) -> LocalTuning:
+    """The tuning of the economic cost with the least quadratic added; TuningError if none helps.
+
+    All is computed in w_i / range_i: there one σ serves every variable, and a change of units
+    changes nothing.
+    """
+    n = problem.n_states
+    ranges = Scale.from_problem(problem).ranges
+    x_range = ranges[:n]
+    u_range = ranges[n:]
+    A = steady.A * x_range / x_range[:, None]
+    B = steady.B * u_range / x_range[:, None]
+    H, size = _scaled_cost(steady, ranges)
+    # C's rows are unit vectors, of which a scaling changes the length alone.
+    C, released = _keepable_constraints(A, B, steady, ranges)
+
+    # In units of the size, so that the solver's tolerances mean what they say.
+    relative = least_addition(A, B, H / size, C, LEAST_CURVATURE, LARGEST_CURVATURE)
+    if relative < NOTHING_ADDED:
+        relative = 0.0
+    sigma = size * relative
+    augmented = H + sigma * np.eye(len(H))
+    # Half of the curvature leaves the conditioning some room.
+    least = 0.5 * LEAST_CURVATURE * size
+    scaled = convexify(A, B, augmented / least, C, alpha=1.0)
+    economic, _ = local_feedback(A, B, augmented / least, C)
+    tuned, P = local_feedback(A, B, scaled.hessian, C)
+
+    # Back into the units of the problem.
+    force_scale = C @ ranges
+    convex = Convexification(
+        hessian=least * scaled.hessian / np.outer(ranges, ranges),
+        delta_P=least * scaled.delta_P / np.outer(x_range, x_range),
+        F=least * scaled.F / np.outer(force_scale, force_scale),
+        alpha=scaled.alpha,
+        beta=scaled.beta,
+    )
+    gain_scale = u_range[:, None] / x_range
+    return LocalTuning(
+        convexification=convex,
+        constraints=C,
+        economic=economic * gain_scale,
+        tuned=tuned * gain_scale,
+        value=least * P / np.outer(x_range, x_range),
+        addition=Addition(sigma, ranges, C, released, reason),
+    )
+
+
+def _keepable_constraints(
+    A: Array,
+    B: Array,
+    steady: SteadyState,
+    ranges: Array,
+) -> tuple[Array, tuple[str, ...]]:
+    """Active bounds that a stable local feedback can keep, (n_c, n+m), and the others in words.
+
+    The bound with the least price over its range is given up first. Raises TuningError where the
+    actions do not stabilise the plant at all.
+    """
+    prices = np.abs(steady.C @ (steady.multipliers * ranges))
+    order = [int(i) for i in np.argsort(-prices, kind="stable")]
+    identity = np.eye(len(ranges))
+    for count in range(len(order), -1, -1):
+        kept = sorted(order[:count])
+        try:
+            local_feedback(A, B, identity, steady.C[kept])
+        except TuningError:
+            if count == 0:
+                raise
+            continue
+        released = sorted(order[count:])
+        return steady.C[kept], tuple(steady.active[i] for i in released)
+    raise AssertionError("the loop ends by a return or an error")
+
+
 @dataclass(frozen=True)
 class EconomicTuning:
     """Tuned θ with its certificate.
 
     `economic` is the local feedback gain (m, n) of the economic cost itself (γ = 1, active
-    constraints kept), `tuned` that of the convexified one.
+    constraints kept), `tuned` that of the convexified one. Where no convex cost has the economic
+    one's local optimum, `addition` is the least quadratic that was added to it, and `economic` is
+    the gain with it; else it is None.
     """
 
     parameters: Parameters
@@ -369,6 +625,7 @@ class EconomicTuning:
     convexification: Convexification
     economic: Array
     tuned: Array
+    addition: Addition | None = None
 
     @property
     def gain_error(self) -> float:
@@ -378,25 +635,19 @@ class EconomicTuning:
 
     def __str__(self) -> str:
         steady = self.steady_state
-        convex = self.convexification
-        active = []
-        active_multipliers = steady.C @ steady.multipliers
-        for name, multiplier in zip(steady.active, active_multipliers, strict=True):
-            active.append(f"{name} (multiplier {multiplier:.4g})")
-        economic = _five_digits(np.linalg.eigvalsh(steady.hessian))
-        convexified = _five_digits(np.linalg.eigvalsh(convex.hessian))
-        return "\n".join(
-            [
-                f"optimal steady state  x = {_five_digits(steady.x)}, "
-                f"u = {_five_digits(steady.u)}, cost {steady.cost:.6g}",
-                f"strictly active       {', '.join(active) or 'none'}",
-                f"economic Hessian      eigenvalues {economic}",
-                f"convexified Hessian   eigenvalues {convexified}, "
-                f"α = {convex.alpha:.4g}, β = {convex.beta:.4g}, F = {_five_digits(convex.F)}",
-                f"economic gain         {_five_digits(self.economic)}",
-                f"tuned gain            differs by {self.gain_error:.2g}",
-            ]
-        )
+        lines = [
+            f"optimal steady state  x = {_five_digits(steady.x)}, u = {_five_digits(steady.u)}",
+            f"its cost              {steady.cost:.6g} a sample",
+        ]
+        for sentence in steady.prices():
+            lines.append(f"active bound          {sentence}")
+        if not steady.active:
+            lines.append("active bound          none")
+        if self.addition is None:
+            lines.append("added quadratic       none: the economic cost is tuned as it is")
+        else:
+            lines.append(f"added quadratic       {self.addition}")
+        return "\n".join(lines)
 
 
 def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
@@ -407,35 +658,43 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     λ_θ undoes the rotations by costate and storage, so that V_θ is to second order the economic
     value; c_λ is ℓ_s. θ is rounded to six digits.
 
+    Where no convex cost has the economic one's local optimum, the least quadratic is added to it,
+    and a TuningWarning says so once (docs/how-to/when-tuning-fails.md).
+
     Args:
         problem: The control problem.
         blocks: The blocks of θ; the paper's where they are None.
 
     Raises:
-        TuningError: Steady state, local optimum or convexification do not exist.
+        TuningError: There is no steady state, a penalty is too small, or no action stabilises the
+            plant.
     """
     # The certificate compares gains, which need A and B to more digits than a controller does.
     substeps = linearisation_substeps(problem)
     steady = optimal_steady_state(dataclasses.replace(problem, substeps=substeps))
-    n = problem.n_states
-    A = steady.A
-    B = steady.B
-    C = steady.C
     try:
-        # The economic cost's feedback is what the tuned one must equal: the certificate.
-        economic, _ = local_feedback(A, B, steady.hessian, C)
-        convex = convexify(A, B, steady.hessian, C)
-        tuned, P = local_feedback(A, B, convex.hessian, C)
-    except TuningError as error:
-        raise TuningError(
-            f"{error}. {steady}. Change the bounds so that the cost has a minimum with other "
-            "bounds active, or the model's economic cost so that it has one inside them"
-        ) from error
-    dynamics = np.hstack([A, B])
+        local = _local_tuning(steady)
+    except TuningError as reason:
+        try:
+            local = _augmented_tuning(problem, steady, str(reason))
+        except TuningError as error:
+            raise TuningError(
+                f"{error}. {steady}. Look at the model and its bounds there: no quadratic cost "
+                "helps"
+            ) from error
+    if local.addition is not None:
+        warn(f"model '{problem.model.name}': {local.addition}", TuningWarning)
+    n = problem.n_states
+    convex = local.convexification
+    P = local.value
+    dynamics = np.hstack([steady.A, steady.B])
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
     q = steady.multipliers
+    if local.addition is not None and local.addition.released:
+        # What pushes onto a bound that cannot be kept would make the loop unstable.
+        q = q * local.constraints.any(axis=0)
     q_x = q[:n]
-    C_x = C[:, :n]
+    C_x = local.constraints[:, :n]
     # The storage, less what F costs at stage 0, whose state need not keep the constraints.
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
 
@@ -452,8 +711,14 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
         "b_lambda": steady.costate + initial @ shift_x,
     }
     rounded = {name: _rounded(value) for name, value in values.items()}
-    parameters = Parameters.naive(problem, blocks).replace(rounded)
-    return EconomicTuning(parameters, steady, convex, economic, tuned)
+    return EconomicTuning(
+        parameters=Parameters.naive(problem, blocks).replace(rounded),
+        steady_state=steady,
+        convexification=convex,
+        economic=local.economic,
+        tuned=local.tuned,
+        addition=local.addition,
+    )
 
 
 def linearisation_substeps(problem: Problem) -> int:

@@ -24,6 +24,10 @@ class ParameterError(ControllerError):
     """A parameter vector, block or file is malformed."""
 
 
+class TuningWarning(CosimWarning):
+    """The economic cost cannot be tuned as it is: a quadratic is added to it."""
+
+
 class OptimumError(ControllerError):
     """The dynamic-programming policy cannot be computed, stored or read."""
 

@@ -141,10 +141,11 @@ def tuning(
     out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
     json: cli.JsonOption = False,
 ) -> None:
-    """Tune the NMPC's cost by economics (controller `tuned`) and show the certificate.
+    """Tune the NMPC's cost by economics (controller `tuned`) and say what came of it.
 
-    It says which constraint enters, the eigenvalues of the economic and of the convexified
-    cost's Hessian, and the local feedback gain of both.
+    It says where the optimal steady state is, what each active bound costs, and whether a
+    quadratic had to be added to the cost. The certificate, with the eigenvalues of the Hessians
+    and the local feedback gains, is under --json.
 
     Args:
         out: Write the tuned θ to this TOML file.
@@ -161,20 +162,37 @@ def tuning(
         result = tune(problem)
         parameters = result.parameters.replace({"c_lambda": value_offset(task, problem)})
         steady, convex = result.steady_state, result.convexification
-        rows = [tuple(line.split("  ", 1)) for line in str(result).splitlines()]
-        out_.table(f"economic tuning of {scenario}", ("", "certificate"), rows)
+        rows = []
+        for line in str(result).splitlines():
+            subject, _, words = line.partition("  ")
+            rows.append((subject, words.strip()))
+        out_.table(f"economic tuning of {scenario}", ("", "result"), rows)
         if out is not None:
             parameters.save(out)
             out_.note(f"θ {parameters.hash} is in {out.resolve()}")
         states, actions = steady.x.tolist(), steady.u.tolist()
         prices = (steady.C @ steady.multipliers).tolist()
+        addition = None
+        if result.addition is not None:
+            addition = {
+                "size": result.addition.size,
+                "ranges": result.addition.ranges.tolist(),
+                "released": list(result.addition.released),
+                "reason": result.addition.reason,
+                "meaning": str(result.addition),
+            }
         document = {
             "scenario": scenario,
             "steady_state": {"states": states, "actions": actions, "cost": steady.cost},
             "active": dict(zip(steady.active, prices, strict=True)),
             "economic_eigenvalues": np.linalg.eigvalsh(steady.hessian).tolist(),
             "convexified_eigenvalues": np.linalg.eigvalsh(convex.hessian).tolist(),
+            "alpha": convex.alpha,
+            "beta": convex.beta,
+            "force": convex.F.tolist(),
+            "economic_gain": result.economic.tolist(),
             "gain_error": result.gain_error,
+            "addition": addition,
             "parameters": parameters.hash,
         }
         out_.json(document)

@@ -52,3 +52,12 @@ def test_the_tunings_certificate_as_json(cosim):
     assert abs(document["active"]["X2 ≥ 25 %"] - 60.29) < 0.01
     assert document["economic_eigenvalues"][0] < 0 < document["convexified_eigenvalues"][0]
     assert document["gain_error"] < 1e-8
+
+
+def test_the_tuning_reads_aloud(cosim):
+    code, out, _ = cosim("tuning", "--scenario", "paper")
+    words = " ".join(out.replace("│", " ").split())
+    assert code == 0
+    assert "X2 ≥ 25 % costs 60.3 a per cent" in words
+    assert "none: the economic cost is tuned as it is" in words
+    assert "eigenvalues" not in words

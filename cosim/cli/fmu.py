@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -76,6 +76,11 @@ def check_fmu(
     actions: str = "",
     cost: str | None = None,
     sampling_time: Annotated[float | None, typer.Option(min=1e-9, max=1e12)] = None,
+    model: Annotated[str | None, typer.Option("--model", "-m")] = None,
+    scenario: Annotated[str | None, typer.Option("--scenario", "-s")] = None,
+    points: Annotated[int | None, typer.Option(min=1, max=100_000)] = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    tolerance: Annotated[float | None, typer.Option(min=1e-15, max=1e3)] = None,
     json: JsonOption = False,
 ) -> None:
     """Find out whether an FMU can be a plant, and how, by trying it.
@@ -84,16 +89,42 @@ def check_fmu(
     verdict. Exit code 0: it can be a plant; 1: it cannot; 2: there is no such FMU. This runs the
     FMU's native code.
 
+    With --model, the FMU is compared with a controller's model: next states, cost and outputs at
+    random points, the largest difference of each and where it is. Exit code 0: both agree; 1: they
+    do not; 2: bad input.
+
     Args:
+        model: Model to compare with, module:factory.
+        scenario: With --model: names the variables in place of the options, and bounds the points.
+        points: With --model: number of points; default 100.
+        seed: With --model: seed of the points; default 0.
+        tolerance: With --model: share of what a quantity varies that may differ; default 0.001.
         states: Names, comma-separated; without them as `scenario init` guesses.
         actions: Names, comma-separated.
         cost: Output that is the stage cost.
         sampling_time: Sampling time in s.
     """
+    if model is not None:
+        _compare_with_model(
+            file,
+            model,
+            json,
+            scenario=scenario,
+            states=split_names(states),
+            actions=split_names(actions),
+            stage_cost=cost,
+            sampling_time=sampling_time,
+            points=100 if points is None else points,
+            seed=0 if seed is None else seed,
+            tolerance=1e-3 if tolerance is None else tolerance,
+        )
+        return
     with output(json) as out_:
-        from cosim.core.errors import FmuWarning, PlantError
+        from cosim.core.errors import CosimError, FmuWarning, PlantError
         from cosim.plant.check import PlantCheck, check_plant
 
+        if (scenario, points, seed, tolerance) != (None,) * 4:
+            raise CosimError("--scenario, --points, --seed and --tolerance go with --model")
         path = Path(file).absolute()
         try:
             with warnings.catch_warnings():
@@ -120,6 +151,23 @@ def check_fmu(
             print(outcome.verdict)
         out_.json(outcome.to_dict())
     if not outcome.usable:
+        raise typer.Exit(1)
+
+
+def _compare_with_model(file: str, model: str, json: bool, **options: Any) -> None:
+    """Print the differences between an FMU and a model; exit code 1 where they do not agree."""
+    with output(json) as out_:
+        from cosim.model_check import check_model
+
+        outcome = check_model(file, model, **options)
+        for remark in outcome.remarks:
+            out_.note(f"remark: {remark}")
+        if not json:
+            for difference in outcome.differences:
+                print(difference)
+            print(outcome.verdict)
+        out_.json(outcome.to_dict())
+    if not outcome.agrees:
         raise typer.Exit(1)
 
 

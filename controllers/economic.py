@@ -32,6 +32,8 @@ LARGEST_CURVATURE = 1e4
 """Largest curvature that the least added quadratic may rely on, as a multiple of that size."""
 NOTHING_ADDED = 1e-7
 """An addition below this share of that size is the solver's rounding, and none is made."""
+LINEAR = 1e-9
+"""Curvature, as a share of that size, below which an economic cost counts as linear."""
 
 
 @dataclass(frozen=True)
@@ -523,11 +525,15 @@ def _scaled_cost(steady: SteadyState, ranges: Array) -> tuple[Array, float]:
     return H, float(size) or 1.0
 
 
-def _local_tuning(steady: SteadyState) -> LocalTuning:
+def _local_tuning(problem: Problem, steady: SteadyState) -> LocalTuning:
     """The tuning of the economic cost as it is; TuningError where no convex cost is its equal."""
     A = steady.A
     B = steady.B
     C = steady.C
+    H, size = _scaled_cost(steady, Scale.from_problem(problem).ranges)
+    if np.abs(H).max() < LINEAR * size:
+        # αH is zero: nothing determines α, and the solver's rounding would be the cost's size.
+        raise TuningError("the cost is linear, so that no curvature says how to come back to it")
     # The economic cost's feedback is what the tuned one must equal: the certificate.
     economic, _ = local_feedback(A, B, steady.hessian, C)
     convex = convexify(A, B, steady.hessian, C)
@@ -673,7 +679,7 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     substeps = linearisation_substeps(problem)
     steady = optimal_steady_state(dataclasses.replace(problem, substeps=substeps))
     try:
-        local = _local_tuning(steady)
+        local = _local_tuning(problem, steady)
     except TuningError as reason:
         try:
             local = _augmented_tuning(problem, steady, str(reason))

@@ -100,7 +100,7 @@ def with_one_fast(fast, *others):
     return [fast, *(pytest.param(seed, marks=pytest.mark.slow) for seed in others)]
 
 
-@pytest.mark.parametrize("seed", with_one_fast(16, 0, 3, 12, 14, 18, 52, 64))
+@pytest.mark.parametrize("seed", with_one_fast(16, 0, 3, 12, 14, 18, 20, 34, 52, 64))
 def test_a_linear_cost_on_a_linear_plant_is_tuned(seed):
     # 16, 52 and 64 have an active bound on which no stable feedback stays.
     problem, rates, inputs, prices = linear_plant(seed)

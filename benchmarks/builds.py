@@ -15,6 +15,7 @@ from unittest.mock import patch
 
 from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks
 from controllers.functions import BUILDS, LONG, build_name
+from controllers.policy_table import table_sources
 from cosim.core.files import replacing
 from cosim.core.scenario import Scenario, presets
 from fmus import PLATFORMS, Platform
@@ -33,7 +34,7 @@ SYSTEMS = {
 
 
 def preset_sources() -> list[dict[str, bytes]]:
-    """C files by name of each library that a preset's controller and its rollouts need.
+    """C files by name of each library that a preset's controllers and rollouts need.
 
     θ has the slack's weights, as in a training, or not; that of rollouts, which `model-based` has
     alone, the model's parameters too.
@@ -58,6 +59,7 @@ def preset_sources() -> list[dict[str, bytes]]:
                 RtiNmpc(problem, Parameters.naive(problem, blocks)).compile(LONG)
             blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=names)
             Rollout(problem, Parameters.naive(problem, blocks), Features(problem))
+    keep(table_sources())
     return found
 
 

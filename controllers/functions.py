@@ -415,6 +415,14 @@ def _compile(compiler: str, files: Mapping[str, bytes], folder: Path) -> str | N
     return None
 
 
+def worth_compiling(samples: int) -> bool:
+    """Whether a run of so many samples is compiled: a long one, unless COSIM_COMPILE says else."""
+    chosen = switch()
+    if chosen == "never":
+        return False
+    return samples >= LONG or chosen == "now"
+
+
 def switch() -> str:
     """`auto`, `never` or `now`, as the environment's COSIM_COMPILE says; ControllerError else."""
     chosen = os.environ.get(SWITCH) or CHOICES[0]

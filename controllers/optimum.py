@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-import itertools
 import json
-from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -29,10 +27,12 @@ from controllers.dynamic_programming import (
     solve,
 )
 from controllers.errors import ModelError, OptimumError, QpError
+from controllers.functions import COMPILED, INTERPRETED, LONG, worth_compiling
 from controllers.model import Model
+from controllers.policy_table import CompiledTable, PolicyTable
 from controllers.problem import VECTORS, PlantProblem, load_model
 from cosim.core.files import cache_folder, read_arrays, write_atomically
-from cosim.core.protocols import Decision, Vector
+from cosim.core.protocols import CompiledLoop, Decision, Vector
 from cosim.core.scenario import ChangeTable, Scenario, is_file
 
 SOLVER_VERSION = 2
@@ -223,17 +223,8 @@ class OptimalPolicy:
         self.problem = plant.problem
         self.optimum = optimum
         self._plant = plant
-        grid = optimum.grid
-        self._axes = [axis.tolist() for axis in grid.axes]
-        # A row (action…, W) for each state of the grid.
-        table = np.column_stack([optimum.actions, optimum.W])
-        self._table = table.tolist()
-        # A cell's corners, and how far each one's row in the table is behind that of the first.
-        self._corners = []
-        shape = [len(axis) for axis in self._axes]
-        for corner in itertools.product((0, 1), repeat=len(shape)):
-            offset = int(np.ravel_multi_index(corner, shape))
-            self._corners.append((corner, offset))
+        self._table = PolicyTable(optimum.grid.axes, optimum.actions, optimum.W)
+        self.functions = INTERPRETED
 
     @classmethod
     def from_scenario(
@@ -271,6 +262,29 @@ class OptimalPolicy:
         """J*: mean of economic cost and penalty per sample under this policy."""
         return self.optimum.gain
 
+    def compile(self, samples: int = LONG) -> None:
+        """Let closed loops of `samples` or more run in compiled code, with the same digits.
+
+        Args:
+            samples: of the run; COSIM_COMPILE says `never`, or `now` for any number.
+        """
+        if worth_compiling(samples):
+            self.functions = COMPILED
+
+    def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:
+        """A new closed loop in compiled code; None if only Python can run it.
+
+        Args:
+            scenario: of the plant; its actions are saturated as it says.
+        """
+        # A plant may have more states than the model, which the loop in C does not pick.
+        if self.functions == INTERPRETED or len(scenario.plant.states) != self.problem.n_states:
+            return None
+        loop = CompiledTable.compile(self._table, self.problem.penalty, scenario)
+        if loop is None:
+            self.functions = INTERPRETED
+        return loop
+
     def reset(self) -> None:
         """Do nothing: the policy has no memory."""
 
@@ -288,11 +302,11 @@ class OptimalPolicy:
             QpError: s or a is not finite.
         """
         state: list[float] = np.asarray(s, dtype=np.float64).tolist()
-        n = len(self._axes)
+        n = self.problem.n_states
         if len(state) != n or not isfinite(sum(state)):
             raise QpError(f"state {state} is not {n} finite numbers", status="bad state")
         # The grid ends where no sample of the closed loop was: say so, and go on.
-        row, clamped = self._lookup(state)
+        row, clamped = self._table.look_up(state)
         status = "clamped" if clamped else "solved"
         if a is None:
             W = row.pop()
@@ -331,37 +345,6 @@ class OptimalPolicy:
     @cached_property
     def _operator(self) -> BellmanOperator:
         return BellmanOperator(self._plant, self.optimum.accuracy)
-
-    def _lookup(self, state: list[float]) -> tuple[list[float], bool]:
-        """Row (action…, W) interpolated at a state in plain Python: a tenth of NumPy's time."""
-        base = 0  # row of the cell's first corner
-        clamped = False
-        fractions = []
-        for x, axis in zip(state, self._axes, strict=True):
-            # The last cell includes its upper end.
-            last_cell = len(axis) - 2
-            cell = bisect_right(axis, x) - 1
-            cell = min(max(cell, 0), last_cell)
-            begin = axis[cell]
-            end = axis[cell + 1]
-            fraction = (x - begin) / (end - begin)
-            if not 0.0 <= fraction <= 1.0:
-                fraction = min(max(fraction, 0.0), 1.0)
-                clamped = True
-            base = base * len(axis) + cell
-            fractions.append(fraction)
-        row = [0.0] * len(self._table[0])
-        for corner, offset in self._corners:
-            weight = 1.0
-            for fraction, high in zip(fractions, corner, strict=True):
-                # Multilinear: the weight of a corner is the product over the axes.
-                weight *= fraction if high else 1.0 - fraction
-            if not weight:
-                continue
-            corner_row = self._table[base + offset]
-            for i, entry in enumerate(corner_row):
-                row[i] += weight * entry
-        return row, clamped
 
 
 # a plant that changes -------------------------------------------------------------------------

@@ -1,10 +1,10 @@
 /* The RTI-NMPC in closed loop with an empirical model: `learning.rollout.Rollout`, compiled.
  *
  * `sizes.h` has K (states and cost) and the work space of `nominal`, CasADi's code for y(s, a; c) and
- * h(s, a). Controller and loop are the package's own C (`loop.h`).
+ * h(s, a). Controller and loop are the package's own C (`rti_loop.h`).
  */
 #define _POSIX_C_SOURCE 199309L
-#include "loop.h"
+#include "rti_loop.h"
 
 #include "sizes.h"
 
@@ -61,10 +61,11 @@ int rollout(const double theta[], const double start[], const double c[], const 
     const LoopPlant plant = {
         empirical_step, &model, model.inputs + N_X, model.inputs, model.output, 2 * K,
     };
-    Loop loop;
+    RtiLoop loop;
     int fault[2];
     memcpy(model.inputs, start, N_X * sizeof *start);
     memcpy(prepared.theta, theta, sizeof prepared.theta);
-    loop_begin(&loop, &prepared, &solved, &work);
-    return (int)loop_run(&loop, &plant, 0, steps, table, fault);
+    rti_loop_begin(&loop, &prepared, &solved, &work);
+    const LoopController law = rti_loop_controller(&loop);
+    return (int)loop_run(&law, &plant, 0, steps, table, fault);
 }

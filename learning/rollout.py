@@ -64,6 +64,7 @@ class Rollout:
             # Where a function says that it is exported, Windows exports no other.
             "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
             "loop.h": (ENGINE_SOURCES / "loop.h").read_bytes(),
+            "rti_loop.h": (ENGINE_SOURCES / "rti_loop.h").read_bytes(),
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
         path = library(sources)

@@ -29,7 +29,7 @@ from controllers.functions import (
     StackedFunction,
     consecutive,
     library,
-    switch,
+    worth_compiling,
 )
 from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions, Spectrum
 from controllers.problem import Problem
@@ -512,7 +512,7 @@ class Engine:
             stagewise = long or stack_needed(functions) > STACK_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
         # Beside what is exported, the engine has derivatives and closed loops.
-        for name in ("sensitivities.h", "loop.h", "engine.c"):
+        for name in ("sensitivities.h", "loop.h", "fmu.h", "rti_loop.h", "engine.c"):
             sources[name] = (ENGINE_SOURCES / name).read_bytes()
         path = library(sources)
         if path is None:
@@ -784,10 +784,7 @@ class RtiNmpc:
         same to rounding and to DAQP's accuracy (`tests/controllers/rti/test_engine.py` holds the
         bounds).
         """
-        chosen = switch()
-        if not self._compilable or chosen == "never":
-            return
-        if samples < LONG and chosen != "now":
+        if not self._compilable or not worth_compiling(samples):
             return
         reason = why_not_in_c(self._functions)
         if reason is not None:

@@ -147,9 +147,9 @@ CompiledLoop = Callable[[Any, int, Array], tuple[int, int, int]]
 """A closed loop in compiled code, from a controller's `compiled_loop` to a plant's `drive`.
 
 It gets an FMU instance's native functions, the number of the first sample, and a table with a row
-for each sample to come: state, action, stage cost, disturbance, value, residual, whether the
-controller failed, seconds of prepare, feedback and step. It returns the sample that it came to,
-what failed there (0: nothing), and FMI's status.
+for each sample to come: state, action, stage cost, disturbance, value, residual, the controller's
+status (`cosim.core.simulation.STATUSES`), seconds of prepare, feedback and step. It returns the
+sample that it came to, what failed there (0: nothing), and FMI's status.
 """
 
 

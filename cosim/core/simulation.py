@@ -24,6 +24,8 @@ MEASURED = (
 
 The last two are there with sensors, under which no compiled loop runs.
 """
+STATUSES = ("solved", FALLBACK, "clamped")
+"""Statuses by their number in a compiled loop's column `failed`; one is a failure."""
 REFRESH = 0.1
 """Seconds between two drawings of a progress bar, at least."""
 PREDICTED = ("predicted_states", "predicted_actions")
@@ -284,9 +286,11 @@ class _Run:
 
     def _keep(self, first: int, table: Array) -> None:
         """Store rows of the compiled loop with their status."""
-        columns = self._fill(first, table)
-        for failed in columns["failed"]:
-            self._status.append(FALLBACK if failed else "solved")
+        position = self._ends[MEASURED.index("failed") - 1]
+        for number in table[:, position]:
+            self._status.append(STATUSES[int(number)])
+        table[:, position] = table[:, position] == STATUSES.index(FALLBACK)
+        self._fill(first, table)
 
     def _fill(self, first: int, table: Array) -> dict[str, Array]:
         """Store rows of the signals that are `MEASURED`, and those that follow; all by name."""

@@ -406,7 +406,7 @@ class Place(NamedTuple):
 
 
 class Order(IntEnum):
-    """When a step reads the outputs; the numbers are those of the controllers' `engine.c`.
+    """When a step reads the outputs; the numbers are those of the controllers' `fmu.h`.
 
     FMI 2.0.5 (p. 109) forbids to get after a set without a step in between, and FMI 3.0 says that
     such a get returns what it returned before the set. `SET_GET_STEP` is therefore for those FMUs
@@ -449,7 +449,7 @@ def _as(buffer: Any, value: float) -> float:
 
 
 class Native(ctypes.Structure):
-    """An instance for compiled code; the C struct is `Plant` of the controllers' `engine.c`."""
+    """An instance for compiled code; the C struct is `Plant` of the controllers' `fmu.h`."""
 
     _fields_: ClassVar[list[tuple[str, Any]]] = [
         ("version", ctypes.c_int),

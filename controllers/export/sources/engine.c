@@ -1,7 +1,8 @@
 /* The library that runs `controllers.RtiNmpc`: the phases of a sample, and whole closed loops with an
  * FMU. */
 #define _POSIX_C_SOURCE 199309L
-#include "loop.h"
+#include "fmu.h"
+#include "rti_loop.h"
 #include "sensitivities.h"
 
 size_t engine_sizes(int what) {
@@ -9,7 +10,7 @@ size_t engine_sizes(int what) {
 }
 
 int engine_prepare(RtiPrepared *prepared, RtiWork *work) {
-    return loop_prepare(prepared, work);
+    return rti_loop_load(prepared, work);
 }
 
 int engine_feedback(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solved, const double a[]) {
@@ -35,7 +36,7 @@ void engine_batch(RtiPrepared *prepared, RtiSolved *solved, RtiWork *work, long 
             memcpy(prepared->theta, theta[k], sizeof theta[k]);
             memcpy(prepared->x, x[k], sizeof x[k]);
             memcpy(prepared->u, u[k], sizeof u[k]);
-            ready = loop_prepare(prepared, work);
+            ready = rti_loop_load(prepared, work);
         }
         const double *const a = enforced ? enforced[k] : 0;
         double *const slope = slopes ? slopes + k * (VALUE + POLICY) : 0;
@@ -58,82 +59,16 @@ int engine_policy(const RtiPrepared *prepared, const RtiSolved *solved, RtiWork 
     return rti_policy(prepared, solved, work, policy);
 }
 
-/* An FMU instance, as `cosim.plant.fmi` hands it over: the FMI functions of its version that set and
- * get reals and make a step; value references and values of what the scenario wires. */
-typedef struct {
-    int version;
-    void (*set)(void), (*get)(void), (*step)(void);
-    void *component;
-    const unsigned *inputs, *outputs, *states;
-    size_t n_inputs, n_outputs, n_states;
-    double *input, *output, *state;
-    double start_time, step_size;
-    int order;     /* when the outputs are read, of the enumeration below */
-    int no_return; /* whether no snapshot can take the FMU back to before its present time */
-} Plant;
+size_t engine_loop_size(void) { return sizeof(RtiLoop); }
 
-/* `cosim.plant.fmi.Order` says which FMU takes which. */
-enum { SET_GET_STEP, GET_SET_STEP, SET_STEP_GET };
-
-static int refused(int status) { return status != 0 && status != 1; }
-
-static int plant_get(const Plant *plant, const unsigned references[], size_t count, double values[]) {
-    typedef int (*Get2)(void *, const unsigned *, size_t, double *);
-    typedef int (*Get3)(void *, const unsigned *, size_t, double *, size_t);
-    return plant->version == 2
-               ? ((Get2)plant->get)(plant->component, references, count, values)
-               : ((Get3)plant->get)(plant->component, references, count, values, count);
+void engine_begin(RtiLoop *loop, RtiPrepared *prepared, RtiSolved *solved, RtiWork *work) {
+    rti_loop_begin(loop, prepared, solved, work);
 }
 
-/* Write the inputs, step, read the states, and the outputs before or after the step as `order` says;
- * `status` gets FMI's own. */
-static int plant_step(void *instance, long long sample, int *status) {
-    typedef int (*Set2)(void *, const unsigned *, size_t, const double *);
-    typedef int (*Set3)(void *, const unsigned *, size_t, const double *, size_t);
-    typedef int (*Step2)(void *, double, double, int);
-    typedef int (*Step3)(void *, double, double, _Bool, _Bool *, _Bool *, _Bool *, double *);
-    const Plant *const plant = instance;
-    const double time = plant->start_time + (double)sample * plant->step_size;
-    _Bool event = 0, terminate = 0, early = 0;
-    double last = INFINITY; /* where the FMU does not say how far it came */
-    if (plant->order == GET_SET_STEP) {
-        *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
-        if (refused(*status)) return FAILED_GET;
-    }
-    *status = plant->version == 2
-                  ? ((Set2)plant->set)(plant->component, plant->inputs, plant->n_inputs, plant->input)
-                  : ((Set3)plant->set)(plant->component, plant->inputs, plant->n_inputs,
-                                       plant->input, plant->n_inputs);
-    if (refused(*status)) return FAILED_SET;
-    if (plant->order == SET_GET_STEP) {
-        *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
-        if (refused(*status)) return FAILED_GET;
-    }
-    *status = plant->version == 2
-                  ? ((Step2)plant->step)(plant->component, time, plant->step_size, plant->no_return)
-                  : ((Step3)plant->step)(plant->component, time, plant->step_size,
-                                         plant->no_return, &event, &terminate, &early, &last);
-    if (refused(*status)) return FAILED_STEP;
-    if (terminate || early || last < time + 0.5 * plant->step_size) return ENDED;
-    if (plant->order == SET_STEP_GET) {
-        *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
-        if (refused(*status)) return FAILED_GET;
-    }
-    *status = plant_get(plant, plant->states, plant->n_states, plant->state);
-    if (refused(*status)) return FAILED_GET;
-    return all_finite(plant->state, (int)plant->n_states) && isfinite(plant->output[0]) ? OK
-                                                                                       : NOT_FINITE;
-}
-
-size_t engine_loop_size(void) { return sizeof(Loop); }
-
-void engine_begin(Loop *loop, RtiPrepared *prepared, RtiSolved *solved, RtiWork *work) {
-    loop_begin(loop, prepared, solved, work);
-}
-
-/* `loop_run` with an FMU, whose outputs are the stage cost and the disturbance. */
-long long engine_run(Loop *loop, Plant *fmu, long long first, long long end, double *table,
+/* `loop_run` with an FMU. */
+long long engine_run(RtiLoop *loop, Plant *fmu, long long first, long long end, double *table,
                      int fault[2]) {
-    const LoopPlant plant = {plant_step, fmu, fmu->input, fmu->state, fmu->output, fmu->n_outputs};
-    return loop_run(loop, &plant, first, end, table, fault);
+    const LoopController law = rti_loop_controller(loop);
+    const LoopPlant plant = fmu_plant(fmu);
+    return loop_run(&law, &plant, first, end, table, fault);
 }

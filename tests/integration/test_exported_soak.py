@@ -21,9 +21,8 @@ FLAGS = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.sanitised
-@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+@pytest.mark.parametrize("hessian", ["gauss-newton", pytest.param("exact", marks=pytest.mark.slow)])
 def test_nothing_is_allocated_or_broken_while_it_steps(tmp_path: Path, hessian: str) -> None:
     if shutil.which(COMPILER) is None:
         pytest.skip("there is no C compiler")

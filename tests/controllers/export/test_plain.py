@@ -152,9 +152,8 @@ SANITISED = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.sanitised
-@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+@pytest.mark.parametrize("hessian", ["gauss-newton", pytest.param("exact", marks=pytest.mark.slow)])
 def test_sanitizers_find_nothing_and_change_no_bit(tmp_path, hessian):
     """Good and wild states and θ, automatic and manual; scratch static and on the stack."""
     scenario = Scenario.load("paper")

@@ -60,9 +60,14 @@ def test_compiled_code_gives_the_interpreters_digits(call, monkeypatch):
 
 
 @needs_compiler
-@pytest.mark.slow
 @pytest.mark.sanitised
-@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize(
+    "call",
+    [
+        pytest.param("two tables", marks=pytest.mark.slow),
+        *(call for call in CALLS if call != "two tables"),
+    ],
+)
 def test_sanitizers_find_nothing_in_exported_c(call, tmp_path):
     """The exact Hessian calls the model's second derivatives too.
 

@@ -26,7 +26,7 @@ CALLS = 300_000
 SECONDS = 60
 SEEDS = {"evaporator": 3} | dict.fromkeys(plants.SHIPPED_PLANTS, 1)
 
-pytestmark = [pytest.mark.slow, pytest.mark.sanitised]
+pytestmark = pytest.mark.sanitised
 
 
 def written(name: str, version: FmiVersion, folder: Path) -> Path:
@@ -41,7 +41,10 @@ def written(name: str, version: FmiVersion, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("name", SEEDS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name == "evaporator" else ()) for name in SEEDS],
+)
 def test_random_calls_break_nothing(tmp_path: Path, name: str, version: FmiVersion) -> None:
     """No sanitizer report, every refusal logged, and a refused call changes nothing."""
     if shutil.which(COMPILER) is None:

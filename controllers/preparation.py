@@ -19,7 +19,7 @@ from controllers.problem import Problem
 from controllers.qp import LEAST_SIZE, SoftQp
 from controllers.reuse import built_once
 from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
-from cosim.core.protocols import Vector
+from cosim.core.protocols import Matrix, Vector
 from cosim.core.validation import instead
 
 SOLVED_RESIDUAL = 1e-8
@@ -120,22 +120,25 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     x_next, jacobian = sampled_jacobian(problem, x, u, symbols["model_parameters"])
     A = jacobian[:, :n]
     B = jacobian[:, n:]
-    offset = x_next - x_s
-    offset = offset - A @ (x - x_s)
-    offset = offset - B @ (u - u_s)
+    from_state = A @ (x - x_s)
+    from_action = B @ (u - u_s)
+    offset = x_next - x_s - from_state - from_action
     offset = offset + symbols["c_f"]
 
-    # The transposes, since CasADi's memory is by columns and C's by rows.
+    # In units of the scale; a derivative of ξ₊ by ξ has both the new and the old state's.
     per_state = 1 / scale.state
-    state_units = ca.DM(np.outer(per_state, scale.state))
-    action_units = ca.DM(np.outer(per_state, scale.action))
-    A_scaled = A * state_units
-    B_scaled = B * action_units
-    return stage_function(
-        "linearise",
-        {"x": x, "u": u, "theta": symbols["theta"]},
-        {"A": A_scaled.T, "B": B_scaled.T, "r": offset / ca.DM(scale.state)},
-    )
+    state_units = np.outer(per_state, scale.state)
+    action_units = np.outer(per_state, scale.action)
+    A_scaled = A * ca.DM(state_units)
+    B_scaled = B * ca.DM(action_units)
+    # The transposes, since CasADi's memory is by columns and C's by rows.
+    results = {
+        "A": A_scaled.T,
+        "B": B_scaled.T,
+        "r": offset / ca.DM(scale.state),
+    }
+    arguments = {"x": x, "u": u, "theta": symbols["theta"]}
+    return stage_function("linearise", arguments, results)
 
 
 def stage_parameter_gradient(
@@ -166,7 +169,13 @@ def stage_parameter_gradient(
     theta = symbols["theta"]
     w = ca.SX.sym("w", n + m)
     chi = ca.SX.sym("chi", n)
-    arguments = {"x": x, "u": u, "theta": theta, "w": w, "chi": chi}
+    arguments = {
+        "x": x,
+        "u": u,
+        "theta": theta,
+        "w": w,
+        "chi": chi,
+    }
 
     # χᵀ(f + J Δw), whose J Δw is one tangent through the model.
     x_next, _ = sampled_jacobian(problem, x, u, symbols["model_parameters"])
@@ -178,11 +187,12 @@ def stage_parameter_gradient(
         guess = ca.SX.sym("guess", n)
         D = _curvature(problem, symbols, x, u, guess)
         lagrangian += ca.dot(M, D)
-        arguments |= {"M": M, "guess": guess}
+        arguments["M"] = M
+        arguments["guess"] = guess
     # By θ and not by p alone: p's symbols are entries of θ's.
     by_theta = ca.gradient(lagrangian, theta)
-    results = {"gradient": by_theta[blocks.slices["p"]]}
-    return stage_function("parameter_gradient", arguments, results)
+    by_parameters = by_theta[blocks.slices["p"]]
+    return stage_function("parameter_gradient", arguments, {"gradient": by_parameters})
 
 
 def stage_function(
@@ -270,25 +280,22 @@ def preparation_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     A, B, r = linearise(arguments["x"], arguments["u"], theta)
     A_k = ca.horzsplit(A, n)
     B_k = ca.horzsplit(B, n)
-    r_k = ca.horzsplit(r, 1)
+    r_k = ca.horzsplit(r)
     L_k = ca.horzsplit(arguments["L"], n + m)
-    q_k = ca.horzsplit(arguments["q"], 1)
+    q_k = ca.horzsplit(arguments["q"])
 
-    # Forward: ξ_0 responds to itself alone, not to the controls before it nor to the offsets.
+    # Forward, from the state of stage 0.
     respond = _respond(n, m, horizon)
-    to_controls = np.zeros((n, width))
-    to_offsets = np.zeros((n, 1))
-    start = np.hstack([to_controls, np.eye(n), to_offsets])
-    dense = ca.Sparsity.dense(*start.shape)
-    responses = [ca.MX(ca.DM(dense, start.reshape(-1, order="F")))]
-    for k in range(horizon):
-        following = respond(A_k[k], B_k[k], r_k[k], responses[k])
+    responses = [_initial_response(n, width)]
+    for dynamics in zip(A_k, B_k, r_k, strict=True):
+        following = respond(*dynamics, responses[-1])
         responses.append(following)
 
     # Backward: the costates' responses, from those of the terminal cost's gradient on.
     differentiate = _differentiate(n, m, horizon)
     costate = arguments["L_N"] @ responses[horizon]
-    costate = ca.horzcat(costate[:, :-1], costate[:, -1] + arguments["q_N"])
+    to_offsets = costate[:, -1] + arguments["q_N"]
+    costate = ca.horzcat(costate[:, :-1], to_offsets)
     rows: list[ca.MX] = []
     for k in reversed(range(horizon)):
         row, costate = differentiate(
@@ -303,9 +310,9 @@ def preparation_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
 
     # Columns behind those of the controls belong to ξ_0, the last one to the offsets.
     states = responses[1:]
-    hessian = _gather(ca.horzcat(*rows), _hessian_positions(n, m, horizon))
-    gamma = _gather(ca.horzcat(*states), _response_positions(n, m, horizon))
-    Phi = [response[:, width : width + n] for response in states]
+    hessian = _gather(rows, _hessian_positions(n, m, horizon))
+    gamma = _gather(states, _response_positions(n, m, horizon))
+    Phi = [response[:, width:-1] for response in states]
     g = [response[:, -1] for response in states]
     F = [row[:, width:-1] for row in rows]
     f = [row[:, -1] for row in rows]
@@ -345,17 +352,26 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     return StackedFunction(preparation_definition(problem, blocks), room=room)
 
 
+def _initial_response(n: int, width: int) -> ca.MX:
+    """Responses (n, width + n + 1) of ξ_0: to itself alone, not to controls nor to offsets."""
+    response = np.zeros((n, width + n + 1))
+    response[:, width:-1] = np.eye(n)
+    # Dense, as those of the other stages are: CasADi would drop the zeros.
+    dense = ca.Sparsity.dense(*response.shape)
+    entries = response.reshape(-1, order="F")
+    return ca.MX(ca.DM(dense, entries))
+
+
 def _respond(n: int, m: int, horizon: int) -> ca.Function:
     """Responses (n, Nm + n + 1) of ξ_{k+1} from those of ξ_k: to each control, ξ_0 and offsets."""
     width = horizon * m
-    symbols = scalar_symbols(
-        {
-            "A": (n, n),
-            "B": (m, n),
-            "r": (n, 1),
-            "response": (n, width + n + 1),
-        }
-    )
+    shapes = {
+        "A": (n, n),
+        "B": (m, n),
+        "r": (n, 1),
+        "response": (n, width + n + 1),
+    }
+    symbols = scalar_symbols(shapes)
     A = symbols["A"]
     B = symbols["B"]
 
@@ -364,83 +380,108 @@ def _respond(n: int, m: int, horizon: int) -> ca.Function:
     # Every control is one sample older; the oldest columns, of controls yet to come, are zero.
     to_controls = following[:, : width - m]
     to_others = following[:, width:]
-    results = {"following": ca.horzcat(B.T, to_controls, to_others)}
-    return stage_function("respond", symbols, results)
+    following = ca.horzcat(B.T, to_controls, to_others)
+    return stage_function("respond", symbols, {"following": following})
 
 
 def _differentiate(n: int, m: int, horizon: int) -> ca.Function:
     """Rows (m, Nm + n + 1) of the gradient in v_k and costates (n, Nm + n + 1) at stage k."""
     width = horizon * m
-    symbols = scalar_symbols(
-        {
-            "A": (n, n),
-            "B": (m, n),
-            "L": (n + m, n + m),
-            "q": (n + m, 1),
-            "response": (n, width + n + 1),
-            "costate": (n, width + n + 1),
-        }
-    )
+    shapes = {
+        "A": (n, n),
+        "B": (m, n),
+        "L": (n + m, n + m),
+        "q": (n + m, 1),
+        "response": (n, width + n + 1),
+        "costate": (n, width + n + 1),
+    }
+    symbols = scalar_symbols(shapes)
     A = symbols["A"]
     B = symbols["B"]
-    L = symbols["L"]
-    q = symbols["q"]
     response = symbols["response"]
     costate = symbols["costate"]
+    L_x, L_v = ca.vertsplit(symbols["L"], [0, n, n + m])
+    q_x, q_v = ca.vertsplit(symbols["q"], [0, n, n + m])
+    L_xx = L_x[:, :n]
+    L_vx = L_v[:, :n]
+    L_vv = L_v[:, n:]
 
     # The costate of stage k+1 responds to v_k first, which is one control more than ξ_k does.
     to_own_control = costate[:, :m]
     to_others = costate[:, m:]
-    states = ca.horzcat(response[:, : width - m], response[:, width:])
+    older = width - m
+    state = ca.horzcat(response[:, :older], response[:, width:])
 
     # Gradient in v_k: L_vx ξ_k + L_vv v_k + q_v + Bᵀ χ_{k+1}.
-    row = L[n:, :n] @ states + B @ to_others
-    row[:, -1] += q[n:]
-    own = B @ to_own_control + L[n:, n:]
+    row = L_vx @ state + B @ to_others
+    row[:, -1] += q_v
+    own = B @ to_own_control + L_vv
 
-    # Costate of stage k: L_xx ξ_k + q_x + Aᵀ χ_{k+1}; ξ_k does not respond to v_k.
-    previous = L[:n, :n] @ states + A @ to_others
-    previous[:, -1] += q[:n]
-    to_controls = previous[:, : width - m]
-    none_yet = ca.SX(n, m)
+    # Costate of stage k: L_xx ξ_k + q_x + Aᵀ χ_{k+1}.
+    previous = L_xx @ state + A @ to_others
+    previous[:, -1] += q_x
+    # ξ_k does not respond to v_k, the one control that is not older.
+    to_controls = ca.horzcat(previous[:, :older], ca.SX(n, m))
     results = {
         "row": ca.horzcat(own, row),
-        "previous": ca.horzcat(to_controls, none_yet, previous[:, width - m :]),
+        "previous": ca.horzcat(to_controls, previous[:, older:]),
     }
     return stage_function("differentiate", symbols, results)
 
 
-def _gather(source: ca.MX, positions: NDArray[np.int64]) -> ca.MX:
-    """Matrix of the source's entries at positions in column-major order; −1 stands for zero."""
-    zero_position = source.numel()
+Positions = NDArray[np.int64]
+"""Places of a matrix's entries in a column of numbers."""
+
+
+def _gather(stages: Sequence[ca.MX], positions: Positions) -> ca.MX:
+    """Matrix of the entries at these positions of the stages side by side; −1 stands for zero."""
+    source = ca.horzcat(*stages)
     extended = ca.vertcat(ca.vec(source), 0)
+    zero_position = source.numel()
     index = np.where(positions < 0, zero_position, positions)
-    by_columns = index.reshape(-1, order="F").tolist()
-    return ca.reshape(extended[by_columns], *positions.shape)
+    # CasADi counts by columns.
+    by_columns = index.reshape(-1, order="F")
+    entries = extended[by_columns.tolist()]
+    return ca.reshape(entries, *positions.shape)
 
 
-def _hessian_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
+def _hessian_positions(n: int, m: int, horizon: int) -> Positions:
     """Positions of H's entries, (Nm, Nm), in the rows of all stages; its upper triangle mirrors."""
+    width = horizon * m
+    first, second = np.indices((width, width))
     # The Hessian is symmetric: of a pair of controls the later one's row has the entry.
-    first, second = np.indices((horizon * m, horizon * m))
-    # Row a of stage k, and control b of stage j ≤ k, whose age there is k − j.
-    k, a = np.divmod(np.maximum(first, second), m)
-    j, b = np.divmod(np.minimum(first, second), m)
-    columns_a_stage = horizon * m + n + 1
-    column: NDArray[np.int64] = k * columns_a_stage + (k - j) * m + b
-    return column * m + a
+    later = np.maximum(first, second)
+    earlier = np.minimum(first, second)
+    stage, row = np.divmod(later, m)
+    column = _control_columns(stage, earlier, n, m, horizon)
+    return column * m + row
 
 
-def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
+def _response_positions(n: int, m: int, horizon: int) -> Positions:
     """Positions of Γ's entries, (Nn, Nm), in the responses of ξ_1 … ξ_N; −1 above its diagonal."""
-    first, second = np.indices((horizon * n, horizon * m))
-    # State i of stage k+1, and control b of stage j, whose age there is k − j.
-    k, i = np.divmod(first, n)
-    j, b = np.divmod(second, m)
+    state, control = np.indices((horizon * n, horizon * m))
+    stage, row = np.divmod(state, n)
+    column = _control_columns(stage, control, n, m, horizon)
+    position = column * n + row
+    # A state does not respond to controls after it.
+    is_later = control // m > stage
+    position[is_later] = -1
+    return position
+
+
+def _control_columns(
+    stage: Positions,
+    control: Positions,
+    n: int,
+    m: int,
+    horizon: int,
+) -> Positions:
+    """Columns of controls 0 … Nm−1, which are by age, in the responses of stages side by side."""
+    own_stage, entry = np.divmod(control, m)
+    age = stage - own_stage
     columns_a_stage = horizon * m + n + 1
-    column = k * columns_a_stage + (k - j) * m + b
-    position = column * n + i
-    return np.asarray(np.where(j <= k, position, -1))
+    column: Positions = stage * columns_a_stage + age * m + entry
+    return column
 
 
 @built_once
@@ -473,16 +514,16 @@ def embedding_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     )
 
     xi = (s - x_s) / state_scale
+    gradient = condensed["f"] + condensed["F"].T @ xi
     # What the states do with no control; the rows have room for the controls' part.
     free = condensed["Phi"].T @ xi + condensed["g"]
     lower = (symbols["x_l"] - x_s) / state_scale
     upper = (symbols["x_u"] - x_s) / state_scale
     results = {
-        "f": condensed["f"] + condensed["F"].T @ xi,
+        "f": gradient,
         "lower": ca.repmat(lower, horizon, 1) - free,
         "upper": ca.repmat(upper, horizon, 1) - free,
     }
-
     arguments = {"s": s, "theta": symbols["theta"], **condensed}
     return define("embedding", arguments, results)
 
@@ -505,9 +546,14 @@ def embedding(
         The function, which writes to the read-out's memory.
     """
     # The three functions work in one memory: nothing is copied between them.
-    shared = {name: prepared.part(name) for name in ("Phi", "g", "f", "F")}
-    shared["theta"] = prepared.inputs["theta"]
-    shared["s"] = read.inputs["s"]
+    shared = {
+        "s": read.inputs["s"],
+        "theta": prepared.inputs["theta"],
+        "Phi": prepared.part("Phi"),
+        "g": prepared.part("g"),
+        "f": prepared.part("f"),
+        "F": prepared.part("F"),
+    }
     first = read.places["f"].start
     last = read.places["row_upper"].stop
     return StackedFunction(
@@ -547,6 +593,28 @@ class _Stage(NamedTuple):
     lower: ca.SX
     upper: ca.SX
 
+    def next_state(self, xi: ca.SX) -> ca.SX:
+        """ξ₊ = A ξ + B v + r."""
+        return self.A.T @ xi + self.B.T @ self.v + self.r
+
+    def cost(self, xi: ca.SX) -> ca.SX:
+        """½wᵀLw + qᵀw of w = (ξ, v)."""
+        w = ca.vertcat(xi, self.v)
+        return _quadratic(self.L, self.q, w)
+
+    def cost_gradients(self, xi: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """L w + q of w = (ξ, v): the cost's gradients in ξ (n,) and v (m,)."""
+        w = ca.vertcat(xi, self.v)
+        gradient = self.L @ w + self.q
+        n = xi.numel()
+        return gradient[:n], gradient[n:]
+
+    def curvatures(self) -> tuple[ca.SX, ca.SX]:
+        """Absolute diagonal entries of L: those of ξ (n,) and of v (m,)."""
+        diagonal = ca.fabs(ca.diag(self.L))
+        n = self.lam.numel()
+        return diagonal[:n], diagonal[n:]
+
 
 def _stages(inputs: Mapping[str, ca.SX]) -> list[_Stage]:
     """The stages 0 … N−1 of the read-out's inputs, which have them side by side."""
@@ -556,7 +624,8 @@ def _stages(inputs: Mapping[str, ca.SX]) -> list[_Stage]:
     parts = []
     for name in _Stage._fields:
         columns = columns_a_stage.get(name, 1)
-        parts.append(ca.horzsplit(inputs[name], columns))
+        by_stage = ca.horzsplit(inputs[name], columns)
+        parts.append(by_stage)
     return [_Stage(*stage) for stage in zip(*parts, strict=True)]
 
 
@@ -604,30 +673,37 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     s = inputs["s"]
     deviation = s - x_s
     penalty = problem.symbolic_penalty(s)
+    linear = ca.dot(b_lambda, deviation)
     value = inputs["constant"] + penalty + symbols["c_lambda"]
-    value += ca.bilin(B_lambda, deviation) + ca.dot(b_lambda, deviation)
+    value += ca.bilin(B_lambda, deviation) + linear
     value /= scale.cost
+    upper = symbols["x_u"] / state_scale
+    origin = x_s / state_scale
     xi = [deviation / state_scale]
     slack = []
     for k, stage in enumerate(stages):
-        w = ca.vertcat(xi[k], stage.v)
-        value += _quadratic(stage.L, stage.q, w)
-        next_xi = stage.A.T @ xi[k] + stage.B.T @ stage.v + stage.r
+        next_xi = stage.next_state(xi[k])
         below = bounds.lower - next_xi
-        above = next_xi - symbols["x_u"] / state_scale + x_s / state_scale
-        t = ca.fmax(ca.fmax(below, above), 0)
-        stage_penalty = ca.dot(bounds.w, t) + ca.dot(bounds.W, t**2)
-        value += problem.discount ** (k + 1) * stage_penalty
+        above = next_xi - upper + origin
+        t = ca.fmax(below, above)
+        t = ca.fmax(t, 0)
+        penalty_of_slack = ca.dot(bounds.w, t) + ca.dot(bounds.W, t**2)
+        value += stage.cost(xi[k])
+        value += problem.discount ** (k + 1) * penalty_of_slack
         xi.append(next_xi)
         slack.append(t)
-    end = xi[horizon]
-    value += _quadratic(L_N, q_N, end)
+    value += _quadratic(L_N, q_N, xi[horizon])
 
     # Backward: costates, from the gradient of the terminal cost to those of the initial one.
-    end_gradient = L_N @ end + q_N
-    initial_gradient = (2 * B_lambda @ deviation + b_lambda) / price
-    penalty_gradient = ca.gradient(penalty, s) / price
-    chi = _costates(stages, xi, end_gradient, [initial_gradient, penalty_gradient])
+    end_gradient = L_N @ xi[horizon] + q_N
+    initial_gradient = 2 * B_lambda @ deviation + b_lambda
+    penalty_gradient = ca.gradient(penalty, s)
+    chi = _costates(
+        stages,
+        xi,
+        end_gradient,
+        [initial_gradient / price, penalty_gradient / price],
+    )
 
     # In the model's units.
     action_scale = ca.repmat(ca.DM(scale.action), 1, horizon)
@@ -635,16 +711,16 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     states = [column * state_scale for column in xi]
     costates = [column * price for column in chi]
     violations = [column * state_scale for column in slack]
-    discounts = problem.discounts[1:].tolist()
     results = {
         "xi": ca.horzcat(*states),
         "t": ca.horzcat(*violations),
         "chi": ca.horzcat(*costates),
         "value": value * scale.cost,
         **_shifted(problem, states, actions, costates),
-        "residual": _residual(stages, L_N, xi, chi, bounds, discounts),
+        "residual": _residual(problem, stages, L_N, xi, chi, bounds),
     }
-    return define("readout", {**inputs, "theta": symbols["theta"]}, results)
+    arguments = {**inputs, "theta": symbols["theta"]}
+    return define("readout", arguments, results)
 
 
 def readout(
@@ -664,19 +740,19 @@ def readout(
         `embedding` gives, and what compiled code gives, `iterations` of the QP's solver and the
         gradient (n_θ,).
     """
-    horizon = problem.horizon
+    n_variables = problem.horizon * problem.n_actions
+    n_rows = problem.horizon * problem.n_states
     from_preparation = ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
-    return StackedFunction(
-        readout_definition(problem, blocks),
-        {name: prepared.part(name) for name in from_preparation},
-        room={
-            "f": horizon * problem.n_actions,
-            "row_lower": horizon * problem.n_states,
-            "row_upper": horizon * problem.n_states,
-            "iterations": 1,
-            "gradient": blocks.size,
-        },
-    )
+    shared = {name: prepared.part(name) for name in from_preparation}
+    room = {
+        "f": n_variables,
+        "row_lower": n_rows,
+        "row_upper": n_rows,
+        "iterations": 1,
+        "gradient": blocks.size,
+    }
+    definition = readout_definition(problem, blocks)
+    return StackedFunction(definition, shared, room=room)
 
 
 def _quadratic(hessian: ca.SX, gradient: ca.SX, w: ca.SX) -> ca.SX:
@@ -695,16 +771,17 @@ def _costates(
     The state of stage k ≥ 1 has a soft row, whose λ is that of stage k−1; that of stage 0 has the
     initial cost in its place.
     """
-    n = end_gradient.numel()
-    chi = [end_gradient + stages[-1].lam]
+    next_costate = end_gradient + stages[-1].lam
+    chi = [next_costate]
     for k in reversed(range(len(stages))):
         stage = stages[k]
-        w = ca.vertcat(xi[k], stage.v)
-        costate = stage.L[:n, :] @ w + stage.q[:n] + stage.A @ chi[0]
+        by_state, _ = stage.cost_gradients(xi[k])
+        costate = by_state + stage.A @ next_costate
         own_gradients = [stages[k - 1].lam] if k else initial_gradients
         for gradient in own_gradients:
             costate += gradient
         chi.insert(0, costate)
+        next_costate = costate
     return chi
 
 
@@ -722,15 +799,16 @@ def _shifted(
     x_s = ca.DM(problem.reference_state)
     u_s = ca.DM(problem.reference_action)
     next_states = [column + x_s for column in states[1:]]
-    # A stage that comes to weigh γᵏ⁻¹ in place of γᵏ has costates 1/γ as large.
-    next_costates = [column / problem.discount for column in costates[2:]]
     later_actions = actions[:, 1:]
     last_action = actions[:, -1]
     next_actions = ca.horzcat(later_actions, last_action)
+    # A stage that comes to weigh γᵏ⁻¹ in place of γᵏ has costates 1/γ as large.
+    next_costates = [column / problem.discount for column in costates[2:]]
+    next_costates.append(costates[-1])
     return {
         "next_x": ca.horzcat(*next_states),
         "next_u": next_actions + ca.repmat(u_s, 1, problem.horizon),
-        "next_chi": ca.horzcat(*next_costates, costates[-1]),
+        "next_chi": ca.horzcat(*next_costates),
     }
 
 
@@ -756,12 +834,12 @@ def _readout_symbols(n: int, m: int, horizon: int) -> dict[str, ca.SX]:
 
 
 def _residual(
+    problem: Problem,
     stages: Sequence[_Stage],
     L_N: ca.SX,
     xi: Sequence[ca.SX],
     chi: Sequence[ca.SX],
     bounds: _SoftBounds,
-    discounts: Sequence[float],
 ) -> ca.SX:
     """How far a solution is from optimal, without a unit and without what condensing rounds off.
 
@@ -774,32 +852,38 @@ def _residual(
     with y = ξ_{k+1}. The last is that of the soft bound Σ t + (W/w) t²; feasibility, sign and
     complementarity at once. All are zero exactly at the solution.
     """
-    n = L_N.size1()
-    next_weights = [stage.L[:n, :n] for stage in stages[1:]]
-    next_weights.append(L_N)
+    next_discounts = problem.discounts[1:].tolist()
+    terminal_curvature = ca.fabs(ca.diag(L_N))
+    next_curvatures = [stage.curvatures()[0] for stage in stages[1:]]
+    next_curvatures.append(terminal_curvature)
     errors = []
     for k, stage in enumerate(stages):
         v = stage.v
         nu = stage.nu
-        w = ca.vertcat(xi[k], v)
-        cost = stage.L[n:, :] @ w + stage.q[n:]
+        _, cost = stage.cost_gradients(xi[k])
         pull = stage.B @ chi[k + 1]
         # The curvature in v_k: of its own stage, and of the next one through the state.
-        own_curvature = ca.fabs(ca.diag(stage.L[n:, n:]))
-        next_curvature = ca.fabs(ca.diag(next_weights[k]))
-        curvature = own_curvature + stage.B**2 @ next_curvature
+        _, own_curvature = stage.curvatures()
+        curvature = own_curvature + stage.B**2 @ next_curvatures[k]
         size = ca.fmax(ca.fabs(cost), ca.fabs(pull))
         size = ca.fmax(size, ca.fabs(nu))
         size = ca.fmax(size, curvature)
         size = ca.fmax(size, LEAST_SIZE)
-        errors.append(ca.fabs(cost + pull + nu) / size)
+        stationarity = ca.fabs(cost + pull + nu)
+        errors.append(stationarity / size)
 
-        projection = _symbolic_projection(v + nu / size, stage.lower, stage.upper)
+        pushed = v + nu / size
+        projection = _symbolic_projection(pushed, stage.lower, stage.upper)
         errors.append(ca.fabs(v - projection))
 
-        relative_lam = stage.lam / (discounts[k] * bounds.w)
-        errors.append(_soft_bound_error(xi[k + 1], relative_lam, bounds))
+        weight = next_discounts[k] * bounds.w
+        soft_bound_error = _soft_bound_error(xi[k + 1], stage.lam / weight, bounds)
+        errors.append(soft_bound_error)
+    return _largest(errors)
 
+
+def _largest(errors: Sequence[ca.SX]) -> ca.SX:
+    """The largest of all entries of these vectors."""
     entries = ca.vertsplit(ca.vertcat(*errors))
     largest = entries[0]
     for error in entries[1:]:
@@ -809,7 +893,8 @@ def _residual(
 
 def _symbolic_projection(values: ca.SX, lower: ca.SX, upper: ca.SX) -> ca.SX:
     """Projection of values on the box between the limits."""
-    return ca.fmin(ca.fmax(values, lower), upper)
+    from_below = ca.fmax(values, lower)
+    return ca.fmin(from_below, upper)
 
 
 def _soft_bound_error(y: ca.SX, relative_lam: ca.SX, bounds: _SoftBounds) -> ca.SX:
@@ -817,10 +902,15 @@ def _soft_bound_error(y: ca.SX, relative_lam: ca.SX, bounds: _SoftBounds) -> ca.
     shifted = y + relative_lam
     nearest = _symbolic_projection(shifted, bounds.lower, bounds.upper)
     beyond = shifted - nearest
-    charged = ca.fmax(ca.fabs(beyond) - 1, 0)
-    violation = charged / (1 + 2 * bounds.W / bounds.w)
+    # The slack's weight holds y on the bound until λ is larger than it: a distance of 1 here.
+    excess = ca.fabs(beyond) - 1
+    charged = ca.fmax(excess, 0)
+    curvature = 2 * bounds.W / bounds.w
+    violation = charged / (1 + curvature)
     proximal = nearest + ca.sign(beyond) * violation
-    return ca.fabs(y - proximal) / (1 + ca.fabs(y))
+    error = ca.fabs(y - proximal)
+    size = 1 + ca.fabs(y)
+    return error / size
 
 
 @dataclass(frozen=True)
@@ -840,7 +930,8 @@ class Spectrum:
         """Whether an eigenvalue is so close to the floor that the lift has a kink there."""
         # At the floor itself the lift has a kink, and its derivative is one-sided.
         distance = np.abs(self.values - self.floor)
-        size = np.maximum(1.0, np.abs(self.values))
+        size = np.abs(self.values)
+        size = np.maximum(1.0, size)
         at_floor = distance < tolerance * size
         return bool(at_floor.any())
 
@@ -850,25 +941,40 @@ class Spectrum:
         L, X and the seed are in the model's units. The derivative of a spectral function is a
         Schur product with its divided differences in the eigenbasis (Daleckii and Krein).
         """
-        values = self.values
-        lifted = np.maximum(values, self.floor)
-        unlifted = (values > self.floor).astype(float)
-
-        # Divided differences (P(a) − P(b)) / (a − b); of equal eigenvalues the derivative of P.
-        gap = values[:, :, None] - values[:, None, :]
-        rise = lifted[:, :, None] - lifted[:, None, :]
-        derivative = unlifted[:, :, None] * unlifted[:, None, :]
-        size = np.maximum(1.0, np.abs(values).max())
-        same = np.abs(gap) < 1e-12 * size
-        divisor = np.where(same, 1, gap)
-        divided = np.where(same, derivative, rise / divisor)
-
+        divided = self._divided_differences()
         # Seed and result are in the model's units, the eigenvectors in those of `ranges`.
         metric = np.outer(self.ranges, self.ranges)
-        transposed = self.vectors.transpose(0, 2, 1)
-        in_eigenbasis = transposed @ (seed / metric) @ self.vectors
-        product = self.vectors @ (divided * in_eigenbasis) @ transposed
-        return np.asarray(product * metric)
+        vectors = self.vectors
+        transposed = vectors.transpose(0, 2, 1)
+        scaled_seed = seed / metric
+        in_eigenbasis = transposed @ scaled_seed @ vectors
+        product = divided * in_eigenbasis
+        scaled_result = vectors @ product @ transposed
+        return np.asarray(scaled_result * metric)
+
+    def _divided_differences(self) -> Vector:
+        """(P(a) − P(b)) / (a − b) of a block's eigenvalues (N, s, s), or P' where a is b."""
+        values = self.values
+        lifted = np.maximum(values, self.floor)
+        derivative = (values > self.floor).astype(float)
+
+        a, b = _pairs(values)
+        lifted_a, lifted_b = _pairs(lifted)
+        derivative_a, derivative_b = _pairs(derivative)
+        gap = a - b
+        rise = lifted_a - lifted_b
+        largest = np.abs(values).max()
+        same = np.abs(gap) < 1e-12 * max(1.0, largest)
+        # No division where the result is not used.
+        divisor = np.where(same, 1, gap)
+        return np.where(same, derivative_a * derivative_b, rise / divisor)
+
+
+def _pairs(values: Vector) -> tuple[Vector, Vector]:
+    """First (N, s, 1) and second (N, 1, s) members of all pairs of entries in rows (N, s)."""
+    first = values[:, :, None]
+    second = values[:, None, :]
+    return first, second
 
 
 class GaussNewton:
@@ -893,32 +999,40 @@ class GaussNewton:
     ) -> None:
         horizon = problem.horizon
         width = problem.n_states + problem.n_actions
+        n = problem.n_states
         self.functions: dict[str, StackedFunction] = {}
-        self.discounts = problem.discounts[:-1]
-        self._end_discount = float(problem.discounts[-1])
         scale = problem.scale
         # A derivative by scaled variables has their scales as factors.
         self.bend = np.outer(scale.both, scale.both) / scale.cost
         self.slope = scale.both / scale.cost
+        self._state_bend = self.bend[:n, :n]
+        self._state_slope = self.slope[:n]
+        # γᵏ of the stages, as columns; and γᴺ.
+        self.discounts = problem.discounts[:-1, None]
+        self.end_discount = float(problem.discounts[-1])
         # Views of the preparation's memory: what is written to them is in the QP.
-        self.L = prepared.inputs["L"].reshape(horizon, width, width)
-        self.q = prepared.inputs["q"].reshape(horizon, width)
-        self._L_N = prepared.inputs["L_N"]
-        self._q_N = prepared.inputs["q_N"]
+        inputs = prepared.inputs
+        self.L = inputs["L"].reshape(horizon, width, width)
+        self.q = inputs["q"].reshape(horizon, width)
+        self._L_N = inputs["L_N"].reshape(n, n)
+        self._q_N = inputs["q_N"]
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over a new θ: its costs, which no linearisation point changes here."""
-        # wᵀB w has the Hessian 2B.
-        hessian_weights = 2 * self.discounts[:, None, None]
-        self.L[:] = hessian_weights * parameters["B_l"] * self.bend
-        self.q[:] = self.discounts[:, None] * parameters["b_l"] * self.slope
+        discounts = self.discounts
+        end_discount = self.end_discount
+        self.L[:] = self.cost_hessians(parameters["B_l"]) * self.bend
+        self.q[:] = discounts * parameters["b_l"] * self.slope
 
-        n = self._q_N.size
-        state_bend = self.bend[:n, :n]
-        state_slope = self.slope[:n]
-        terminal = 2 * self._end_discount * parameters["B_Vf"] * state_bend
-        self._L_N[:] = terminal.reshape(-1)
-        self._q_N[:] = self._end_discount * parameters["b_Vf"] * state_slope
+        terminal_hessian = 2 * end_discount * parameters["B_Vf"]
+        terminal_gradient = end_discount * parameters["b_Vf"]
+        self._L_N[:] = terminal_hessian * self._state_bend
+        self._q_N[:] = terminal_gradient * self._state_slope
+
+    def cost_hessians(self, B: Matrix) -> Vector:
+        """Hessians 2γᵏB of the stages' costs γᵏwᵀB w, (N, n+m, n+m), in the model's units."""
+        weights = 2 * self.discounts
+        return weights[:, :, None] * B
 
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write L and q for a point of linearisation.
@@ -972,15 +1086,7 @@ class Exact(GaussNewton):
 
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write the convexified blocks and the gradients that go with them; see `GaussNewton`."""
-        curvature = self._curvature
-        # The curvature of the dynamics along χ̄, at the point of linearisation.
-        curvature.inputs["x"][:] = x.reshape(-1)
-        curvature.inputs["u"][:] = u.reshape(-1)
-        curvature.inputs["guess"][:] = costates.reshape(-1)
-        curvature()
-        D = curvature.part("D").reshape(self.L.shape)
-        discounts = self.discounts
-        blocks = 2 * discounts[:, None, None] * self._B + D
+        blocks = self.cost_hessians(self._B) + self._curvatures(x, u, costates)
         if not np.isfinite(blocks).all():
             # The controller refuses the QP; an eigenvalue solver would raise its own error.
             self.L[:] = np.nan
@@ -992,26 +1098,39 @@ class Exact(GaussNewton):
 
         # The cost is expanded about the point of linearisation: its gradient there is that of ℓ_θ,
         # and the QP's variables are deviations from the reference.
-        point = np.concatenate([x, u], axis=1) - self._reference
+        point = np.concatenate([x, u], axis=1)
+        point -= self._reference
         by_blocks = np.einsum("kij,kj->ki", blocks, point)
-        by_cost = 2 * discounts[:, None] * (point @ self._B)
-        gradient = by_cost + discounts[:, None] * self._b - by_blocks
+        by_cost = 2 * self.discounts * (point @ self._B)
+        gradient = by_cost + self.discounts * self._b - by_blocks
         self.L[:] = blocks * self.bend
         self.q[:] = gradient * self.slope
-        constant = (point * (by_blocks - by_cost)).sum() / 2
+        # What is left of the expansion at the reference: ½ pᵀ(L_k − 2γᵏB_l) p of each stage.
+        products = point * (by_blocks - by_cost)
+        constant = products.sum() / 2
         return float(constant)
+
+    def _curvatures(self, x: Matrix, u: Matrix, costates: Matrix) -> Vector:
+        """Curvature D_k (N, n+m, n+m) of the dynamics along χ̄, at the point given to `fill`."""
+        curvature = self._curvature
+        inputs = curvature.inputs
+        inputs["x"][:] = x.reshape(-1)
+        inputs["u"][:] = u.reshape(-1)
+        inputs["guess"][:] = costates.reshape(-1)
+        curvature()
+        return curvature.part("D").reshape(self.L.shape)
 
     def _lift(self, blocks: Vector) -> Vector:
         """What lifts the eigenvalues of blocks (N, n+m, n+m) to the floor; keeps their spectrum."""
         values, vectors = np.linalg.eigh(blocks * self.metric)
-        floor = np.asarray(self.FLOOR * self.discounts[:, None], dtype=np.float64)
+        floor = self.FLOOR * self.discounts
         self.spectrum = Spectrum(values, vectors, floor, self._ranges)
         # What is to be lifted is added: what is above the floor keeps its digits.
         rise = np.maximum(floor - values, 0.0)
         raised_vectors = vectors * rise[:, None, :]
         transposed = vectors.transpose(0, 2, 1)
-        lift = raised_vectors @ transposed / self.metric
-        return np.asarray(lift)
+        lift = raised_vectors @ transposed
+        return np.asarray(lift / self.metric)
 
 
 @built_once
@@ -1022,22 +1141,27 @@ def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> Definition:
     horizon = problem.horizon
     x, u, symbols = _linearisation_symbols(problem, blocks)
     chi = ca.SX.sym("chi", n)
+    D_k = _curvature(problem, symbols, x, u, chi)
     stage = stage_function(
         "curvature_of_stage",
         {"x": x, "u": u, "chi": chi, "theta": symbols["theta"]},
-        {"D": _curvature(problem, symbols, x, u, chi)},
+        {"D": D_k},
     )
-    arguments = matrix_symbols(
-        {
-            "x": (n, horizon),
-            "u": (m, horizon),
-            "guess": (n, horizon),
-            "theta": (blocks.size, 1),
-        }
-    )
+    shapes = {
+        "x": (n, horizon),
+        "u": (m, horizon),
+        "guess": (n, horizon),
+        "theta": (blocks.size, 1),
+    }
+    arguments = matrix_symbols(shapes)
     theta = ca.repmat(arguments["theta"], 1, horizon)
     stages = stage.map(horizon)
-    D = stages(arguments["x"], arguments["u"], arguments["guess"], theta)
+    D = stages(
+        arguments["x"],
+        arguments["u"],
+        arguments["guess"],
+        theta,
+    )
     return define("curvature", arguments, {"D": D})
 
 
@@ -1090,14 +1214,16 @@ class SampleFunctions:
         Returns:
             A QP of views: what is written to the memory changes it.
         """
+        prepared = self.preparation
+        read = self.readout
         return SoftQp(
-            H=self.preparation.matrix("H", before),
-            f=self.readout.part("f", after),
-            lower=self.readout.part("lower", after),
-            upper=self.readout.part("upper", after),
-            rows=self.preparation.matrix("Gamma", before),
-            row_lower=self.readout.part("row_lower", after),
-            row_upper=self.readout.part("row_upper", after),
-            w=self.preparation.part("w", before),
-            W=self.preparation.part("W", before),
+            H=prepared.matrix("H", before),
+            f=read.part("f", after),
+            lower=read.part("lower", after),
+            upper=read.part("upper", after),
+            rows=prepared.matrix("Gamma", before),
+            row_lower=read.part("row_lower", after),
+            row_upper=read.part("row_upper", after),
+            w=prepared.part("w", before),
+            W=prepared.part("W", before),
         )

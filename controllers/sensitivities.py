@@ -7,7 +7,7 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, cached_property
 
 import casadi as ca
@@ -48,17 +48,17 @@ def _theta_lagrangian(
         M: Derivatives of the second-order term by the blocks L_k of the exact Hessian, side by
             side, (n+m, N(n+m)); None where the Hessian is the cost's own.
     """
-    horizon = problem.horizon
     # What does not hold θ has no part in the derivative, and is left out.
+    horizon = problem.horizon
     gamma = problem.discount
     B_l = symbols["B_l"]
     b_l = symbols["b_l"]
     xi = ca.horzsplit(y["xi"])
     chi = ca.horzsplit(y["chi"])
     v = ca.horzsplit(y["v"])
-    t = ca.horzsplit(y["t"])
-    lam = ca.horzsplit(y["lam"])
-    M_k = None if M is None else ca.horzsplit(M, points.size1())
+    slack = ca.horzsplit(y["t"])
+    multipliers = ca.horzsplit(y["lam"])
+    point = ca.horzsplit(points)
 
     # λ_θ(ξ_0), then the stages, then V^f_θ(ξ_N).
     terms = _quadratic_form(symbols["B_lambda"], symbols["b_lambda"], xi[0])
@@ -66,23 +66,27 @@ def _theta_lagrangian(
     for k in range(horizon):
         w = ca.vertcat(xi[k], v[k])
         stage = ca.dot(b_l, w)
-        if M_k is None:
+        if M is None:
             stage += ca.bilin(B_l, w)
         else:
             # The cost expanded about the point, where B_l enters the lifted block by M too.
-            point = points[:, k] - problem.reference
-            stage += ca.bilin(B_l, point, 2 * w - point)
-            stage += 2 * ca.dot(M_k[k], B_l)
-        terms += gamma**k * stage + ca.dot(chi[k + 1], symbols["c_f"])
+            about = point[k] - problem.reference
+            M_k = ca.horzsplit(M, w.numel())[k]
+            stage += ca.bilin(B_l, about, 2 * w - about)
+            stage += 2 * ca.dot(M_k, B_l)
+        dynamics = ca.dot(chi[k + 1], symbols["c_f"])
+        terms += gamma**k * stage + dynamics
 
         # The slack's price, which counts from stage 1 on.
+        t = slack[k]
         next_discount = gamma ** (k + 1)
-        terms += next_discount * ca.dot(symbols["w_sigma"], t[k])
-        terms += next_discount * ca.dot(symbols["W_sigma"], t[k] ** 2)
+        terms += next_discount * ca.dot(symbols["w_sigma"], t)
+        terms += next_discount * ca.dot(symbols["W_sigma"], t**2)
 
         # λ is negative where a lower limit pushes, positive where an upper one does.
-        from_below = ca.fmax(-lam[k], 0)
-        from_above = ca.fmax(lam[k], 0)
+        lam = multipliers[k]
+        from_below = ca.fmax(-lam, 0)
+        from_above = ca.fmax(lam, 0)
         terms += ca.dot(from_below, symbols["x_l"])
         terms -= ca.dot(from_above, symbols["x_u"])
     terminal = _quadratic_form(symbols["B_Vf"], symbols["b_Vf"], xi[horizon])
@@ -114,29 +118,27 @@ class _Sensitivities:
         self.problem = problem
         self.blocks = blocks
         self.exact = exact
-        self.y = scalar_symbols(
-            {
-                "xi": (n, horizon + 1),
-                "v": (m, horizon),
-                "t": (n, horizon),
-                "lam": (n, horizon),
-                "chi": (n, horizon + 1),
-            }
-        )
+        solution_shapes = {
+            "xi": (n, horizon + 1),
+            "v": (m, horizon),
+            "t": (n, horizon),
+            "lam": (n, horizon),
+            "chi": (n, horizon + 1),
+        }
+        self.y = scalar_symbols(solution_shapes)
         self.scaled = scalar_symbols({"v": (m, horizon), "lam": (n, horizon)})
         points = scalar_symbols({"x": (n, horizon), "u": (m, horizon)})
         curvature: dict[str, ca.SX] = {}
         if exact:
-            curvature = scalar_symbols(
-                {
-                    "M": (n + m, horizon * (n + m)),
-                    "guess": (n, horizon),
-                }
-            )
+            curvature_shapes = {
+                "M": (n + m, horizon * (n + m)),
+                "guess": (n, horizon),
+            }
+            curvature = scalar_symbols(curvature_shapes)
+        self.M = curvature.get("M")
 
         symbols = symbolic_theta(problem, blocks)
         theta = symbols["theta"]
-        self.M = curvature.get("M")
         lagrangian = _theta_lagrangian(
             problem,
             symbols,
@@ -147,8 +149,16 @@ class _Sensitivities:
         self.gradient = ca.gradient(lagrangian, theta)
         """All of it but the part of p, which is a sum of a function of one stage."""
 
-        solution = {name: self.y[name] for name in SOLUTION_PARTS} | self.scaled
-        self.inputs = {**solution, **points, "theta": theta, **curvature}
+        self.inputs = {
+            "xi": self.y["xi"],
+            "t": self.y["t"],
+            "chi": self.y["chi"],
+            "v": self.scaled["v"],
+            "lam": self.scaled["lam"],
+            **points,
+            "theta": theta,
+            **curvature,
+        }
 
     def in_scaled_units(self, expression: ca.SX) -> ca.SX:
         """The expression of v and lam in the model's units as one of the scaled ones."""
@@ -172,12 +182,12 @@ class _Sensitivities:
 
         # A stage's gradient is called: written out for each stage its C takes minutes to compile.
         rest = stage_function("value_gradient_rest", self.inputs, results)
-        stage = stage_parameter_gradient(self.problem, self.blocks, exact=self.exact)
-        stages = stage.map(self.problem.horizon)
+        stages = self._stage_gradient.map(self.problem.horizon)
         symbols = _call_symbols(self.inputs)
-        by_stage = stages(*self._stage_arguments(symbols))
+        arguments = self._stage_arguments(symbols)
+        by_stage = stages(*arguments)
         gradient = rest(*symbols.values())
-        gradient[self.blocks.slices["p"]] = ca.sum2(by_stage)
+        gradient[self._parameters] = ca.sum2(by_stage)
         return define("value_gradient", symbols, {"gradient": gradient})
 
     @cached_property
@@ -188,14 +198,12 @@ class _Sensitivities:
         m = problem.n_actions
         horizon = problem.horizon
         width = n + m
-        qp = scalar_symbols(
-            {
-                "A": (n, n * horizon),
-                "B": (m, n * horizon),
-                "L": (width, horizon * width),
-                "L_N": (n, n),
-            }
-        )
+        qp_shapes = {
+            "A": (n, n * horizon),
+            "B": (m, n * horizon),
+            "L": (width, horizon * width),
+            "L_N": (n, n),
+        }
         direction_shapes = {
             "dv": (m * horizon, m),
             "dt": (n * horizon, m),
@@ -205,6 +213,7 @@ class _Sensitivities:
         if self.M is not None:
             direction_shapes["dM"] = (width * horizon * width, m)
             moving.append(self.M)
+        qp = scalar_symbols(qp_shapes)
         directions = scalar_symbols(direction_shapes)
 
         policy = []
@@ -215,20 +224,38 @@ class _Sensitivities:
             # In the model's units: the right-hand side was one unit of the scaled action's price.
             unit = float(problem.scale.action[i] / problem.scale.cost)
             direction = self._direction(qp, column, unit)
-            moved_solution = ca.veccat(*direction.values())
-            derivative = ca.jtimes(self.gradient, ca.veccat(*moving), moved_solution)
+            derivative = _derivative_along(self.gradient, moving, direction.values())
             # dy/dθ is minus the inverse KKT matrix times ∇θ∇_y: hence the sign.
             policy.append(-self.in_scaled_units(derivative))
+            d_xi = direction["xi"]
             d_chi = direction["chi"]
             by_state.append(-d_chi[:, 0])
             # What of the direction the stages' gradients in p need.
-            moved[f"w_{i}"] = ca.vertcat(direction["xi"][:, :horizon], direction["v"])
+            moved[f"w_{i}"] = ca.vertcat(d_xi[:, :-1], direction["v"])
             moved[f"chi_{i}"] = d_chi[:, 1:]
         inputs = {**self.inputs, **qp, **directions}
-        results = {"policy": ca.horzcat(*policy), "state": ca.horzcat(*by_state)}
+        results = {
+            "policy": ca.horzcat(*policy),
+            "state": ca.horzcat(*by_state),
+        }
         if "p" not in self.blocks:
             return define("policy_jacobian", inputs, results)
+        return self._with_parameters(inputs, results, moved)
 
+    def _with_parameters(
+        self,
+        inputs: Mapping[str, ca.SX],
+        results: Mapping[str, ca.SX],
+        moved: Mapping[str, ca.SX],
+    ) -> Definition:
+        """`policy_jacobian` with the rows of the model's parameters p, from the stages' gradients.
+
+        Args:
+            inputs: The function's inputs.
+            results: Its results, without p.
+            moved: Directional derivatives of w and chi by name, for each action.
+        """
+        horizon = self.problem.horizon
         rest = stage_function("policy_jacobian_rest", inputs, {**results, **moved})
         stages = self._moved_parameter_gradient().map(horizon)
         symbols = _call_symbols(inputs)
@@ -236,31 +263,46 @@ class _Sensitivities:
         values = rest(*symbols.values())
         parts = dict(zip(rest.name_out(), values, strict=True))
         jacobian = parts["policy"]
-        for i in range(m):
+        for i in range(self.problem.n_actions):
             along = [parts[f"w_{i}"], parts[f"chi_{i}"]]
             if self.exact:
+                # A direction of M is a column of dM: by stages side by side again.
                 dM = symbols["dM"][:, i]
-                along.append(ca.reshape(dM, width, horizon * width))
+                as_M = ca.reshape(dM, *symbols["M"].shape)
+                along.append(as_M)
             by_stage = stages(*arguments, *along)
-            jacobian[self.blocks.slices["p"], i] = -ca.sum2(by_stage)
+            jacobian[self._parameters, i] = -ca.sum2(by_stage)
         results_with_p = {"policy": jacobian, "state": parts["state"]}
         return define("policy_jacobian", symbols, results_with_p)
+
+    @property
+    def _parameters(self) -> slice:
+        """Place of the model's parameters p in θ."""
+        return self.blocks.slices["p"]
+
+    @property
+    def _stage_gradient(self) -> ca.Function:
+        """A stage's part of the Lagrangian's gradient in p."""
+        return stage_parameter_gradient(self.problem, self.blocks, exact=self.exact)
 
     def _stage_arguments(self, symbols: Mapping[str, ca.MX]) -> list[ca.MX]:
         """Arguments of `stage_parameter_gradient`, those of stage 0, 1, … side by side."""
         problem = self.problem
         horizon = problem.horizon
+        theta = ca.repmat(symbols["theta"], 1, horizon)
         action_scale = ca.repmat(ca.DM(problem.scale.action), 1, horizon)
         reference = ca.repmat(ca.DM(problem.reference), 1, horizon)
+        xi = symbols["xi"]
+        chi = symbols["chi"]
         v = symbols["v"] * action_scale
-        w = ca.vertcat(symbols["xi"][:, :horizon], v)
+        w = ca.vertcat(xi[:, :-1], v)
         w += reference
         arguments = [
             symbols["x"],
             symbols["u"],
-            ca.repmat(symbols["theta"], 1, horizon),
+            theta,
             w,
-            symbols["chi"][:, 1:],
+            chi[:, 1:],
         ]
         if self.exact:
             arguments += [symbols["M"], symbols["guess"]]
@@ -268,8 +310,8 @@ class _Sensitivities:
 
     def _moved_parameter_gradient(self) -> ca.Function:
         """Directional derivative of `stage_parameter_gradient` in w, χ and, if exact, M."""
-        stage = stage_parameter_gradient(self.problem, self.blocks, exact=self.exact)
-        shapes = {name: stage.size_in(i) for i, name in enumerate(stage.name_in())}
+        stage = self._stage_gradient
+        shapes = {name: stage.size_in(name) for name in stage.name_in()}
         arguments = scalar_symbols(shapes)
         moving = ["w", "chi"]
         if self.exact:
@@ -278,7 +320,7 @@ class _Sensitivities:
 
         gradient = stage(*arguments.values())
         variables = [arguments[name] for name in moving]
-        derivative = ca.jtimes(gradient, ca.veccat(*variables), ca.veccat(*along.values()))
+        derivative = _derivative_along(gradient, variables, along.values())
         return stage_function(
             "moved_parameter_gradient",
             {**arguments, **along},
@@ -306,30 +348,37 @@ class _Sensitivities:
         v = ca.reshape(column["dv"], m, horizon)
         t = ca.reshape(column["dt"], n, horizon)
         lam = ca.reshape(column["dlam"], n, horizon)
+        controls = ca.horzsplit(v)
+        multipliers = ca.horzsplit(lam)
 
         # Forward by the dynamics from a state that is given, so does not move.
         xi = [ca.SX(n, 1)]
         for k in range(horizon):
-            next_xi = A[k].T @ xi[k] + B[k].T @ v[:, k]
+            next_xi = A[k].T @ xi[k] + B[k].T @ controls[k]
             xi.append(next_xi)
 
         # Backward by the adjoint recursion; the state of stage k ≥ 1 has the row k−1.
-        chi = [qp["L_N"] @ xi[horizon] + lam[:, horizon - 1]]
+        next_costate = qp["L_N"] @ xi[horizon] + multipliers[-1]
+        chi = [next_costate]
         for k in reversed(range(horizon)):
-            w = ca.vertcat(xi[k], v[:, k])
-            costate = L[k][:n, :] @ w + A[k] @ chi[0]
+            w = ca.vertcat(xi[k], controls[k])
+            by_state = L[k] @ w
+            costate = by_state[:n] + A[k] @ next_costate
             if k:
-                costate += lam[:, k - 1]
+                costate += multipliers[k - 1]
             chi.insert(0, costate)
+            next_costate = costate
 
-        state = ca.DM(problem.scale.state)
-        action = ca.DM(problem.scale.action)
-        price = ca.DM(problem.scale.state_price)
+        # From the QP's units to the model's, and from its unit right-hand side.
+        scale = problem.scale
+        state = ca.DM(scale.state)
+        action = ca.DM(scale.action) * unit
+        price = ca.DM(scale.state_price)
         d_xi = [part * state * unit for part in xi]
         d_chi = [part * price * unit for part in chi]
         direction = {
             "xi": ca.horzcat(*d_xi),
-            "v": v * ca.repmat(action * unit, 1, horizon),
+            "v": v * ca.repmat(action, 1, horizon),
             "t": t * ca.repmat(state * unit, 1, horizon),
             "lam": lam * ca.repmat(price * unit, 1, horizon),
             "chi": ca.horzcat(*d_chi),
@@ -337,6 +386,17 @@ class _Sensitivities:
         if self.exact:
             direction["M"] = column["dM"]
         return direction
+
+
+def _derivative_along(
+    expression: ca.SX,
+    variables: Iterable[ca.SX],
+    direction: Iterable[ca.SX],
+) -> ca.SX:
+    """Directional derivative of an expression in these variables."""
+    variable = ca.veccat(*variables)
+    moved = ca.veccat(*direction)
+    return ca.jtimes(expression, variable, moved)
 
 
 def _call_symbols(inputs: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
@@ -410,9 +470,11 @@ def adjoint_directions(
     violated = active.violated
     if violated.any():
         # The slack of a violated row moves with the row, and λ = ±(w + 2Wt) with the slack.
-        row_change = (dv @ qp.rows.T)[:, violated]
+        row_change = dv @ qp.rows.T
+        row_change = row_change[:, violated]
+        curvature = 2 * qp.W[violated]
         side = np.sign(solution.lam[violated])
-        dlam[:, violated] = 2 * qp.W[violated] * row_change
+        dlam[:, violated] = curvature * row_change
         dt[:, violated] = side * row_change
     return dv, dt, dlam
 
@@ -444,13 +506,22 @@ def curvature_directions(
     for unit, row in zip(units, dv, strict=True):
         # dw of each stage. The rows are x_1 … x_N; x_0 is given and does not move, x_N is in no
         # stage.
-        moved_states = (rows @ row).reshape(horizon, n)
+        moved_states = rows @ row
+        moved_states = moved_states.reshape(horizon, n)
         direction = np.zeros((horizon, width))
         direction[1:, :n] = moved_states[:-1]
         direction[:, n:] = row.reshape(horizon, m)
         direction *= scale.both * unit
-        outer = step[:, :, None] * direction[:, None, :]
-        transposed = direction[:, :, None] * step[:, None, :]
+        outer = _outer_products(step, direction)
+        transposed = _outer_products(direction, step)
         symmetric = (outer + transposed) / 2
-        result.append(contract(symmetric).reshape(-1))
+        dM = contract(symmetric)
+        result.append(dM.reshape(-1))
     return np.array(result)
+
+
+def _outer_products(first: Matrix, second: Matrix) -> Matrix:
+    """Products a bᵀ (N, s, s) of the rows a and b of two matrices (N, s)."""
+    columns = first[:, :, None]
+    rows = second[:, None, :]
+    return columns * rows

@@ -78,6 +78,24 @@ class ActionSlopes(NamedTuple):
     cost_hessian: Matrix
 
 
+class PolicyGradient(NamedTuple):
+    """What a batch of K samples says of the policy.
+
+    θ counts in its prior deviations, actions in their ranges.
+
+    Attributes:
+        gradient: ∇J, (n_θ,).
+        hessian: the Gauss–Newton Hessian E[∇π ∇²_a Q ∇πᵀ], (n_θ, n_θ).
+        metric: E[∇π ∇πᵀ], (n_θ, n_θ).
+        td_errors: (K,).
+    """
+
+    gradient: Vector
+    hessian: Matrix
+    metric: Matrix
+    td_errors: Vector
+
+
 class ActorCritic(Algorithm):
     """Actor-critic: descends the mean cost J along ∇J = E[∇π ∇_a Q] (paper.tex, eq. pg_update).
 
@@ -147,49 +165,39 @@ class ActorCritic(Algorithm):
     def _update(self, number: int) -> Update:
         """The constrained step along −∇J, in a trust region; `number` is the sample's."""
         settings = self.configuration
-        gradient, hessian, metric, errors = self.gradient()
+        batch = self.gradient()
         # A step of length one is as long as the trust region allows, before it shrinks.
-        region = metric / settings.radius**2 + np.eye(len(metric)) / settings.largest_step**2
+        in_actions = batch.metric / settings.radius**2
+        in_theta = np.eye(len(batch.metric)) / settings.largest_step**2
+        region = in_actions + in_theta
         radius = min(1.0, settings.decay_after / (number + 1))
-        fit = trust_region_fit(gradient, hessian, region, radius)
+        fit = trust_region_fit(batch.gradient, batch.hessian, region, radius)
+
         before = self.controller.theta
-        error_size = float(np.sqrt(np.mean(errors * errors)))
+        squared_errors = batch.td_errors * batch.td_errors
+        error_size = float(np.sqrt(np.mean(squared_errors)))
         update = self._step.apply(fit, error_size)
-        step = (self.controller.theta - before) / self._step.scale
+        change = self.controller.theta - before
+        step = change / self._step.scale
         # What was seen of another policy says less of this one.
-        length = min(float(step @ region @ step) ** 0.5, 1.0)
-        self._critic.forget(settings.forgetting * (1.0 - length))
+        length = float(step @ region @ step) ** 0.5
+        similarity = 1.0 - min(length, 1.0)
+        self._critic.forget(settings.forgetting * similarity)
         return update
 
-    def gradient(self) -> tuple[Vector, Matrix, Matrix, Vector]:
-        """The policy gradient of a full batch, which counts in the critic from there on.
-
-        Returns:
-            ∇J (n_θ,), the Gauss–Newton Hessian E[∇π ∇²_a Q ∇πᵀ] and the metric E[∇π ∇πᵀ] (n_θ, n_θ)
-            in θ's prior deviations and the actions' ranges, and the TD errors, (K,).
-        """
+    def gradient(self) -> PolicyGradient:
+        """The policy gradient of a full batch, which counts in the critic from there on."""
         batch = self._batch
         states = batch["s"]
         deviation = self._deviation()
-        # Errors of the nominal model at the actions that were applied.
-        applied = self._model(states, batch["a"])
-        prediction_errors = batch["next_s"] - applied.following
-        if not self._has_coordinates:
-            self._begin(states, prediction_errors)
         at_policy = self._model(states, batch["policy"])
-        following = at_policy.following
-        # An advantage that corrects the model needs a critic of the plant, not of the model.
-        if self.strategy.probability > 0:
-            systematic = linear_part(states, prediction_errors)
-            following = following + systematic
-            prediction_errors = prediction_errors - systematic
-        for error in prediction_errors:
-            self._errors.add(error)
+        following, prediction_errors = self._predict(at_policy.following)
 
         # The critic: the cost of the policy's action, and what is expected after it.
         errors = self._errors.values
         penalty = ExpectedPenalty(self.scenario.state_penalty, errors)
-        greedy_cost = batch["cost"] - np.einsum("km,km->k", at_policy.cost_gradient, deviation)
+        cost_of_exploring = np.einsum("km,km->k", at_policy.cost_gradient, deviation)
+        greedy_cost = batch["cost"] - cost_of_exploring
         reward = greedy_cost + penalty.value(following)
         if not np.isfinite(reward).all():
             raise DivergenceError("the costs or the predictions are not finite")
@@ -206,20 +214,49 @@ class ActorCritic(Algorithm):
         cost_curvature = at_policy.cost_hessian * np.outer(self._range, self._range)
         value_curvature = np.einsum("kni,knl,klj->kij", gain, curvature, gain)
 
-        # The chain rule through the policy.
-        jacobian = batch["jacobian"] * self._step.scale / self._range[:, None]
+        # The chain rule through the policy: ∇J = E[∇π ∇_a Q] (paper.tex, eq. pg_update).
+        jacobian = batch["jacobian"] * self._step.scale
+        jacobian = jacobian / self._range[:, None]
+        action_slope = cost_slope + value_slope
+        action_curvature = cost_curvature + value_curvature
         count = len(states)
         metric = np.einsum("kmi,kmj->ij", jacobian, jacobian) / count
-        gradient = np.einsum("kmi,km->i", jacobian, cost_slope + value_slope) / count
-        action_curvature = cost_curvature + value_curvature
+        gradient = np.einsum("kmi,km->i", jacobian, action_slope) / count
         hessian = np.einsum("kmi,kmn,knj->ij", jacobian, action_curvature, jacobian) / count
 
         # What realised costs and next states say of the slope beyond the model.
         innovation = np.einsum("kn,kn->k", slope, prediction_errors - mean_error)
-        terms = np.mean(np.sum(cost_slope**2 + value_slope**2, axis=1))
+        squared_terms = cost_slope**2 + value_slope**2
+        terms = np.mean(np.sum(squared_terms, axis=1))
         features = np.einsum("kmi,km->ki", jacobian, deviation / self._range)
         weights = self._advantage(features, td_errors + innovation, metric, float(terms))
-        return gradient + metric @ weights, hessian, metric, td_errors
+        gradient = gradient + metric @ weights
+        return PolicyGradient(gradient, hessian, metric, td_errors)
+
+    def _predict(self, at_policy: Matrix) -> tuple[Matrix, Matrix]:
+        """Take in the batch's prediction errors.
+
+        Args:
+            at_policy: next states of the nominal model under the policy, (K, n).
+
+        Returns:
+            The predictions of the next states under the policy, and the errors that are left of the
+            predictions at the actions that were applied, (K, n).
+        """
+        states = self._batch["s"]
+        applied = self._model(states, self._batch["a"])
+        errors = self._batch["next_s"] - applied.following
+        if not self._has_coordinates:
+            self._begin(states, errors)
+        following = at_policy
+        # An advantage that corrects the model needs a critic of the plant, not of the model.
+        if self.strategy.probability > 0:
+            systematic = linear_part(states, errors)
+            following = following + systematic
+            errors = errors - systematic
+        for error in errors:
+            self._errors.add(error)
+        return following, errors
 
     def _begin(self, states: Matrix, errors: Matrix) -> None:
         """Take the coordinates from the first batch: deviations of θ that have no unit."""
@@ -238,10 +275,12 @@ class ActorCritic(Algorithm):
 
     def _deviation(self) -> Vector:
         """a − π(s) of the batch, (K, m), less its mean under saturation; zero in greedy samples."""
+        policy = self._batch["policy"]
         explored = self._batch["explored"]
+        deviation: Matrix = self._batch["a"] - policy
+        deviation[~explored] = 0.0
         # At an actuator's bound the noise has a mean, which is no slope of the cost.
-        bias = self.strategy.bias(self._batch["policy"][explored])
-        deviation = np.where(explored[:, None], self._batch["a"] - self._batch["policy"], 0.0)
+        bias = self.strategy.bias(policy[explored])
         deviation[explored] -= np.nan_to_num(bias)
         return deviation
 
@@ -261,14 +300,17 @@ class ActorCritic(Algorithm):
             terms: mean square of the slope's terms.
         """
         settings = self.configuration
-        noise = float(np.mean(td_errors**2)) + np.finfo(float).tiny
+        forgetting = settings.forgetting
+        tiny = np.finfo(float).tiny
+        noise = float(np.mean(td_errors**2)) + tiny
         information = features.T @ features / noise
         moment = features.T @ td_errors / noise
-        self._information = settings.forgetting * self._information + information
-        self._moment = settings.forgetting * self._moment + moment
+        self._information = forgetting * self._information + information
+        self._moment = forgetting * self._moment + moment
         # E|∇πᵀw|² = τ² tr E[∇π ∇πᵀ] is a share of what the model's slope is made of.
-        variance = settings.advantage_width**2 * terms / max(metric.trace(), np.finfo(float).tiny)
-        scaled = variance * self._information + np.eye(self._moment.size)
+        trace = max(metric.trace(), tiny)
+        variance = settings.advantage_width**2 * terms / trace
+        scaled = variance * self._information + np.eye(moment.size)
         weights: Vector = np.linalg.solve(scaled, variance * self._moment)
         return weights
 
@@ -326,25 +368,34 @@ class NominalModel:
         p = ca.DM(start.of_model(model))
         x = ca.SX.sym("x", problem.n_states)
         u = ca.SX.sym("u", problem.n_actions)
-        following = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
+        simulate = discretise(model, problem.sampling_time, problem.substeps)
+        following = simulate(x, u, d, p)
+        gain = ca.jacobian(following, u)
         cost = economic_cost(model)(x, u, d, p)
         hessian, gradient = ca.hessian(cost, u)
-        self._function = ca.Function(
-            "slopes", [x, u], [following, ca.jacobian(following, u), gradient, hessian]
-        )
+        results = [following, gain, gradient, hessian]
+        self._function = ca.Function("slopes", [x, u], results)
 
     def __call__(self, states: Matrix, actions: Matrix) -> ActionSlopes:
         """The model at states (K, n) and actions (K, m)."""
-        count, n = states.shape
-        m = actions.shape[1]
         # CasADi takes a sample a column, and puts the samples' matrices beside each other.
         following, gain, gradient, hessian = self._function(states.T, actions.T)
+        count = len(states)
         return ActionSlopes(
             following=following.full().T,
-            gain=gain.full().reshape(n, count, m).transpose(1, 0, 2),
+            gain=_by_sample(gain, count),
             cost_gradient=gradient.full().T,
-            cost_hessian=hessian.full().reshape(m, count, m).transpose(1, 0, 2),
+            cost_hessian=_by_sample(hessian, count),
         )
+
+
+def _by_sample(beside: ca.DM, count: int) -> Vector:
+    """The matrices (K, rows, m) of K samples that stand beside each other, (rows, Km)."""
+    matrix = beside.full()
+    rows = len(matrix)
+    by_row: Vector = matrix.reshape(rows, count, -1)
+    by_sample: Vector = by_row.transpose(1, 0, 2)
+    return by_sample
 
 
 class ExpectedPenalty:
@@ -359,8 +410,10 @@ class ExpectedPenalty:
         self._penalty = penalty
         self._errors = SortedErrors(errors)
         # Errors that are all the same leave a kink: a distance that is tiny beside them.
-        least = 1e-6 * (1.0 + np.abs(errors).max(axis=0))
-        self._distance = np.maximum(DIFFERENCE_SHARE * errors.std(axis=0), least)
+        largest = np.abs(errors).max(axis=0)
+        least = 1e-6 * (1.0 + largest)
+        distance = DIFFERENCE_SHARE * errors.std(axis=0)
+        self._distance = np.maximum(distance, least)
 
     def _by_state(self, predictions: Matrix) -> Matrix:
         """Expected penalty of each state's bounds, (n, K)."""
@@ -380,11 +433,14 @@ class ExpectedPenalty:
         above = self._by_state(predictions + distance)
         here = self._by_state(predictions)
         below = self._by_state(predictions - distance)
-        slope = (above - below).T / (2.0 * distance)
+        rise = above - below
+        slope = rise.T / (2.0 * distance)
         # The penalty is convex: less than nothing is rounding.
-        second = np.maximum(above + below - 2.0 * here, 0.0).T / distance**2
+        bend = np.maximum(above + below - 2.0 * here, 0.0)
+        second = bend.T / distance**2
         curvature = np.zeros((count, n, n))
-        curvature[:, range(n), range(n)] = second
+        diagonal = range(n)
+        curvature[:, diagonal, diagonal] = second
         return slope, curvature
 
 
@@ -432,17 +488,20 @@ class DifferentialValue:
             self._spread = np.where(spread > 0, spread, 1.0)
         features = self._features(states)
         # The mean of z zᵀ is that of its mean, and the covariance.
+        mean_error = errors.mean(axis=0)
         scaled = errors / self._spread
-        covariance = np.atleast_2d(np.cov(scaled.T, bias=True))
-        expected = self._features(following + errors.mean(axis=0))
-        expected[:, -self._rows.size :] += covariance[self._rows, self._columns]
+        covariance = np.cov(scaled.T, bias=True)
+        covariance = np.atleast_2d(covariance)
+        expected = self._features(following + mean_error)
+        n_products = self._rows.size
+        expected[:, -n_products:] += covariance[self._rows, self._columns]
         change = features - expected
         # The constant feature stands for the mean cost.
         change[:, 0] = 1.0
         self._matrix = self._matrix + features.T @ change
         self._moment = self._moment + features.T @ reward
-        weights: Vector = np.linalg.lstsq(self._matrix, self._moment)[0].astype(np.float64)
-        self.weights = weights
+        weights, *_ = np.linalg.lstsq(self._matrix, self._moment)
+        self.weights = weights.astype(np.float64)
         td_errors: Vector = reward - change @ self.weights
         return td_errors
 
@@ -455,21 +514,24 @@ class DifferentialValue:
         """1, z_i and z_i z_j (i ≤ j) of z = (s − centre) / spread, (K, 1+n+n(n+1)/2)."""
         z = (states - self._centre) / self._spread
         products = z[:, self._rows] * z[:, self._columns]
-        return np.hstack([np.ones((len(z), 1)), z, products])
+        return np.hstack([_ones(z), z, products])
 
     def hessian(self) -> Matrix:
         """∇²W, (n, n)."""
         n = self._centre.size
-        scaled = np.zeros((n, n))
-        scaled[self._rows, self._columns] = self.weights[1 + n :]
-        hessian: Matrix = (scaled + scaled.T) / np.outer(self._spread, self._spread)
+        half = np.zeros((n, n))
+        half[self._rows, self._columns] = self.weights[1 + n :]
+        units = np.outer(self._spread, self._spread)
+        hessian: Matrix = (half + half.T) / units
         return hessian
 
     def gradient(self, states: Matrix) -> Matrix:
         """∇W at states (K, n), (K, n)."""
         n = self._centre.size
-        at_centre = self.weights[1 : 1 + n] / self._spread
-        gradient: Matrix = at_centre + (states - self._centre) @ self.hessian()
+        slopes = self.weights[1 : 1 + n]
+        at_centre = slopes / self._spread
+        distance = states - self._centre
+        gradient: Matrix = at_centre + distance @ self.hessian()
         return gradient
 
     def state_dict(self) -> State:
@@ -494,10 +556,17 @@ class DifferentialValue:
 def linear_part(states: Matrix, errors: Matrix) -> Matrix:
     """The part of errors (K, n) that is affine in the states (K, n), by least squares, (K, n)."""
     spread = states.std(axis=0)
-    z = (states - states.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    features = np.hstack([np.ones((len(z), 1)), z])
-    part: Matrix = features @ np.linalg.lstsq(features, errors)[0]
+    spread = np.where(spread > 0, spread, 1.0)
+    z = (states - states.mean(axis=0)) / spread
+    features = np.hstack([_ones(z), z])
+    coefficients, *_ = np.linalg.lstsq(features, errors)
+    part: Matrix = features @ coefficients
     return part
+
+
+def _ones(rows: Matrix) -> Matrix:
+    """The constant feature of these rows, (K, 1)."""
+    return np.ones((len(rows), 1))
 
 
 def trust_region_fit(
@@ -524,18 +593,28 @@ def trust_region_fit(
     slopes = vectors.T @ gradient
 
     def excess(multiplier: float) -> float:
-        return float(np.linalg.norm(slopes / (curvatures + multiplier))) - radius
+        step = slopes / (curvatures + multiplier)
+        return float(np.linalg.norm(step)) - radius
 
     def length(step: Vector) -> float:
         return float(np.sqrt(step @ region @ step))
 
     # Where J has no curvature, only the region bounds the step, by this multiplier.
     steepest = float(np.linalg.norm(slopes)) / radius
-    multiplier = LEAST_MULTIPLIER * max(float(curvatures.max()), steepest) + np.finfo(float).tiny
+    largest = max(float(curvatures.max()), steepest)
+    multiplier = LEAST_MULTIPLIER * largest + np.finfo(float).tiny
     if excess(multiplier) > 0:
-        multiplier = brentq(excess, multiplier, multiplier + steepest, rtol=LEAST_MULTIPLIER)
+        multiplier = brentq(
+            excess,
+            multiplier,
+            multiplier + steepest,
+            rtol=LEAST_MULTIPLIER,
+        )
+    # The Hessian without its negative curvatures, back in θ's coordinates: V⁻ᵀ is R V.
     dual = region @ vectors
-    convex = (dual * curvatures) @ dual.T
+    weighted = dual * curvatures
+    convex = weighted @ dual.T
+    metric = convex + multiplier * region
     # α = 2 makes the metric H + μR that of dᵀ(H + μR)d/2.
-    fit = policy_gradient_fit(gradient, 2.0, convex + multiplier * region)
+    fit = policy_gradient_fit(gradient, 2.0, metric)
     return fit.within(radius, length)

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -33,7 +33,7 @@ from learning.configuration import Configuration, Count, Share
 from learning.persistence import (
     effective_number,
     error_covariance,
-    estimated,
+    estimate_persistence,
     mean_error_covariance,
 )
 
@@ -70,6 +70,11 @@ class EmpiricalModelConfiguration(Configuration):
         4.0,
         description="standard deviations by which errors must look correlated in time, or they "
         "count as independent",
+    )
+    largest_persistence: Share = Field(
+        0.99,
+        description="largest share of an error that the next sample keeps: errors that last for "
+        "100 samples; what lasts longer is a mean",
     )
     fit_rounds: Count = Field(
         6,
@@ -126,9 +131,10 @@ def displaced(nominal: Array, magnitudes: Array, share: Any) -> list[Any]:
     for i, (value, magnitude) in enumerate(zip(nominal, magnitudes, strict=True)):
         if value == 0:
             values.append(magnitude * share[i])
-        else:
-            # A factor of one where the magnitude is the value's own.
-            values.append(value * (1 + magnitude / value * share[i]))
+            continue
+        # A factor of one where the magnitude is the value's own.
+        relative = magnitude / value
+        values.append(value * (1 + relative * share[i]))
     return values
 
 
@@ -149,30 +155,12 @@ class Features:
     """
 
     def __init__(self, problem: Problem, smallest_error_size: float = 0.1) -> None:
-        model = problem.model
-        x, u, d, p = model.symbols()
-        step = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
-        outputs = ca.vertcat(step, economic_cost(model)(x, u, d, p))
-        # Parameters are c times their value larger, disturbances c times their magnitude.
-        c = ca.SX.sym("c", p.numel() + d.numel())
-        disturbed = displaced(
-            model.nominal_disturbance, model.disturbance_magnitudes, c[p.numel() :]
-        )
-        at_errors = ca.vertcat(ca.DM(model.nominal_parameters) * (1 + c[: p.numel()]), *disturbed)
-        (y,) = ca.substitute([outputs], [ca.vertcat(p, d)], [at_errors])
+        x, u, c, y = _with_errors(problem)
+        n_parameters = len(problem.model.parameters)
         G = ca.jacobian(y, c)
-
-        # The size of the error that disturbances in proportion to their magnitudes would make.
-        by_disturbance = ca.substitute(G[:, p.numel() :], c, ca.DM.zeros(c.shape))
-        size = ca.sqrt(ca.sum2(by_disturbance**2))
-        size_at = ca.Function("size", [x, u], [size])
-        # An output that no disturbance moves has no size; it is in its own unit.
-        at_reference = size_at(problem.reference_state, problem.reference_action).full()[:, 0]
-        floored = []
-        for entry, reference in zip(ca.vertsplit(size), at_reference, strict=True):
-            least = smallest_error_size * reference
-            floored.append(ca.fmax(entry, least) if reference > 0 else 1.0)
-        h = ca.densify(ca.vertcat(*floored))
+        at_nominal = ca.DM.zeros(c.shape)
+        by_disturbance = ca.substitute(G[:, n_parameters:], c, at_nominal)
+        h = _error_sizes(problem, x, u, by_disturbance, smallest_error_size)
         y = ca.densify(y)
         G = ca.densify(G)
 
@@ -183,23 +171,27 @@ class Features:
         self._function = ca.Function("features", arguments, [y, G.T, h], names, ["y", "G", "h"])
         self.n_outputs, self.n_parameters = G.shape
         self.n_inputs = problem.n_states + problem.n_actions
-        self.compiled = None
-        if not_in_c([self._function]) is not None:
-            return
+        self.compiled: Any = None
+        if not_in_c([self._function]) is None:
+            self._compile(problem.n_states)
+
+    def _compile(self, n_states: int) -> None:
+        """Have the function in C, which needs no copies; without a compiler CasADi's stays."""
         sizes = {
-            "N_X": problem.n_states,
+            "N_X": n_states,
             "N_IN": self.n_inputs,
             "K": self.n_outputs,
             "P": self.n_parameters,
             **work_sizes("FEATURES", self._function),
         }
-        path = library(
-            {
-                "sizes.h": c_definitions(sizes),
-                "nominal.h": "#define CASADI_SYMBOL_EXPORT static\n" + c_source([self._function]),
-                "features.c": (files("learning") / "features.c").read_bytes(),
-            }
-        )
+        function = c_source([self._function])
+        loop = files("learning") / "features.c"
+        sources: dict[str, str | bytes] = {
+            "sizes.h": c_definitions(sizes),
+            "nominal.h": f"#define CASADI_SYMBOL_EXPORT static\n{function}",
+            "features.c": loop.read_bytes(),
+        }
+        path = library(sources)
         if path is not None:
             self.compiled = ctypes.CDLL(str(path)).features_at
 
@@ -215,46 +207,212 @@ class Features:
         """
         M = len(inputs)
         K = self.n_outputs
-        n = K - 1
+        shape_of_G = (M, K, self.n_parameters)
         if self.compiled is not None:
             y = np.empty((M, K))
-            G = np.empty((M, K, self.n_parameters))
+            G = np.empty(shape_of_G)
             h = np.empty((M, K))
             rows = np.ascontiguousarray(inputs)
-            self.compiled(*pointers(rows, c), ctypes.c_longlong(M), *pointers(y, G, h))
+            arguments = pointers(rows, c)
+            results = pointers(y, G, h)
+            self.compiled(*arguments, ctypes.c_longlong(M), *results)
             return y, G, h
-        results = self._function(inputs[:, :n].T, inputs[:, n:].T, c)
-        y, G_transposed, h = (result.full() for result in results)
-        G = G_transposed.T.reshape(M, K, self.n_parameters)
-        return y.T, G, h.T
+        n = K - 1
+        states = inputs[:, :n]
+        actions = inputs[:, n:]
+        y_columns, G_columns, h_columns = self._function(states.T, actions.T, c)
+        # CasADi has a sample in each column, and G's transposes side by side.
+        y = y_columns.full().T
+        h = h_columns.full().T
+        G = G_columns.full().T
+        return y, G.reshape(shape_of_G), h
+
+
+def _with_errors(problem: Problem) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Symbols of x, u and the parameters' errors c, and the outputs y = (s₊, ℓ) as of these."""
+    model = problem.model
+    x, u, d, p = model.symbols()
+    simulate = discretise(model, problem.sampling_time, problem.substeps)
+    cost = economic_cost(model)
+    outputs = ca.vertcat(simulate(x, u, d, p), cost(x, u, d, p))
+
+    # Parameters are c times their value larger, disturbances c times their magnitude.
+    n_parameters = p.numel()
+    c = ca.SX.sym("c", n_parameters + d.numel())
+    growth = 1 + c[:n_parameters]
+    parameters = ca.DM(model.nominal_parameters) * growth
+    disturbances = displaced(
+        model.nominal_disturbance,
+        model.disturbance_magnitudes,
+        c[n_parameters:],
+    )
+    at_errors = ca.vertcat(parameters, *disturbances)
+    (y,) = ca.substitute([outputs], [ca.vertcat(p, d)], [at_errors])
+    return x, u, c, y
+
+
+def _error_sizes(
+    problem: Problem,
+    x: ca.SX,
+    u: ca.SX,
+    by_disturbance: ca.SX,
+    smallest: float,
+) -> ca.SX:
+    """h (K,): the error that disturbances in proportion to their magnitudes would make.
+
+    Args:
+        problem: has the reference.
+        x: symbol of the state.
+        u: symbol of the action.
+        by_disturbance: derivative of the outputs by the disturbances' errors, (K, n_d).
+        smallest: least h, as a share of its value at the reference.
+    """
+    size = ca.sqrt(ca.sum2(by_disturbance**2))
+    size_at = ca.Function("size", [x, u], [size])
+    at_reference = size_at(problem.reference_state, problem.reference_action)
+    floored = []
+    for entry, reference in zip(ca.vertsplit(size), at_reference.full()[:, 0], strict=True):
+        if reference > 0:
+            floored.append(ca.fmax(entry, smallest * reference))
+        else:
+            # An output that no disturbance moves has no size; it is in its own unit.
+            floored.append(ca.SX(1.0))
+    return ca.densify(ca.vertcat(*floored))
+
+
+class _Design(NamedTuple):
+    """The model at M inputs, linear about parameters c.
+
+    Attributes:
+        y: (M, K).
+        G: derivative of y by c, (M, K, p).
+        h: (M, K).
+        rows: derivative of the outputs by (c, W), (M, K, p + K(1+n+m)).
+    """
+
+    y: Array
+    G: Array
+    h: Array
+    rows: Array
+
+    @property
+    def over_h(self) -> Array:
+        """The derivative over the size of the errors: that of what is fitted."""
+        size: Array = self.h[:, :, None]
+        return self.rows / size
+
+
+class Standardisation(NamedTuple):
+    """The unit of the inputs (n+m,), so that one width of the prior serves all slopes.
+
+    Attributes:
+        centre: is zero in these units.
+        unit: is one.
+    """
+
+    centre: Array
+    unit: Array
+
+    def design(self, features: Features, inputs: Array, c: Array) -> _Design:
+        """The model at inputs (M, n+m) about parameters c (p,)."""
+        y, G, h = features(inputs, c)
+        standardised = (inputs - self.centre) / self.unit
+        return _Design(y, G, h, design_rows(G, standardised))
 
 
 class _Regression:
-    """The regression of outputs (M, K) on inputs (M, n+m), linear about parameters c."""
+    """The regression of outputs (M, K) on inputs (M, n+m), linear about parameters c.
 
-    def __init__(self, features: Features, inputs: Array, outputs: Array) -> None:
+    A fit takes every `step`-th sample, and with each the one before where errors persist.
+    """
+
+    def __init__(
+        self,
+        features: Features,
+        inputs: Array,
+        outputs: Array,
+        settings: EmpiricalModelConfiguration,
+    ) -> None:
         self._features = features
         self._inputs = inputs
         self._outputs = outputs
-        # Standardised inputs: one width of the prior serves all slopes.
-        self.centre: Array = inputs.mean(axis=0)
+        self._settings = settings
         unit = inputs.std(axis=0)
-        self.unit: Array = np.where(unit > 0, unit, 1.0)
+        unit = np.where(unit > 0, unit, 1.0)
+        self.standardisation = Standardisation(inputs.mean(axis=0), unit)
 
-    def linearised(self, c: Array, rows: Rows) -> tuple[Array, Array]:
-        """Design (·, K, q) and target (·, K) of some samples about c, over h."""
-        y, G, h = self._features(self._inputs[rows], c)
-        standardised = (self._inputs[rows] - self.centre) / self.unit
-        design = design_rows(G, standardised) / h[:, :, None]
-        return design, (self._outputs[rows] - y + G @ c) / h
+    def equations(
+        self,
+        c: Array,
+        step: int,
+        persistence: Array,
+    ) -> tuple[Array, Array]:
+        """Design (·, K, q) and target (·, K) of a fit about c, over h.
 
-    def errors(self, mean: Array, rows: Rows) -> Array:
+        Args:
+            c: errors of the parameters, (p,).
+            step: every so many samples are taken.
+            persistence: Φ, (K, K).
+        """
+        rows = self._samples(step)
+        design, target = self._linearised(c, rows)
+        if persistence.any():
+            # What persists of the error before is no news (Cochrane and Orcutt 1949).
+            design_before, target_before = self._linearised(c, rows[1:] - 1)
+            design = design[1:] - persistence @ design_before
+            target = target[1:] - target_before @ persistence.T
+        return design, target
+
+    def residuals(
+        self,
+        mean: Array,
+        step: int,
+        earlier_persistence: Array,
+        n_earlier: int,
+    ) -> tuple[Array, Array]:
+        """Residuals e (·, K) with the coefficients `mean`, and what persists of the errors, Φ.
+
+        Args:
+            mean: coefficients (c, W), (q,).
+            step: every so many samples are taken.
+            earlier_persistence: Φ of an earlier estimate, (K, K).
+            n_earlier: number of its residuals.
+        """
+        rows = self._samples(step)
+        errors = self._errors(mean, rows)
+        # Of consecutive samples the errors before are at hand.
+        before = errors[:-1] if step == 1 else self._errors(mean, rows[1:] - 1)
+        persistence = estimate_persistence(
+            errors[1:],
+            before,
+            earlier_persistence,
+            n_earlier,
+            doubt=self._settings.persistence_doubt,
+            largest=self._settings.largest_persistence,
+        )
+        if persistence.any():
+            errors = errors[1:] - before @ persistence.T
+        return errors - errors.mean(axis=0), persistence
+
+    def _samples(self, step: int) -> Rows:
+        """Every so many samples, from the first one on."""
+        return np.arange(0, len(self._inputs), step)
+
+    def _linearised(self, c: Array, rows: Rows) -> tuple[Array, Array]:
+        """Design and target of some samples about c, over h."""
+        design = self.standardisation.design(self._features, self._inputs[rows], c)
+        target = self._outputs[rows] - design.y + design.G @ c
+        return design.over_h, target / design.h
+
+    def _errors(self, mean: Array, rows: Rows) -> Array:
         """Errors r (·, K) of some samples with the coefficients `mean`."""
         p = self._features.n_parameters
-        y, G, h = self._features(self._inputs[rows], mean[:p])
-        standardised = (self._inputs[rows] - self.centre) / self.unit
-        design = design_rows(G, standardised) / h[:, :, None]
-        errors: Array = (self._outputs[rows] - y) / h - design[:, :, p:] @ mean[p:]
+        c = mean[:p]
+        W = mean[p:]
+        design = self.standardisation.design(self._features, self._inputs[rows], c)
+        of_nominal = (self._outputs[rows] - design.y) / design.h
+        linear_part = design.over_h[:, :, p:] @ W
+        errors: Array = of_nominal - linear_part
         return errors
 
 
@@ -305,7 +463,8 @@ class EmpiricalModel:
         if earlier is not None:
             earlier_residuals = earlier.residuals
             earlier_persistence = earlier.persistence
-        regression = _Regression(features, inputs, outputs)
+        regression = _Regression(features, inputs, outputs, settings)
+        largest_error = settings.largest_parameter_error
 
         # All fits but the last take every `thinning`-th sample.
         thinning = max(len(inputs) // settings.fit_samples, 1)
@@ -314,56 +473,38 @@ class EmpiricalModel:
         nominal_errors = outputs[::thinning] - y
         # The sizes of the nominal model's errors set the widths of W.
         priors = _priors(nominal_errors, y, features, settings)
-        least_variance = INTEGRATION_ERROR**2 * ((y / h) ** 2).mean(axis=0)
-
-        def split(mean: Array, step: int) -> tuple[Array, Array]:
-            """Errors of every so many samples, as residuals and Φ."""
-            errors = regression.errors(mean, np.arange(0, len(inputs), step))
-            before = errors[:-1]
-            if step > 1:
-                before = regression.errors(mean, np.arange(step, len(inputs), step) - 1)
-            persistence = estimated(
-                errors[1:],
-                before,
-                settings.persistence_doubt,
-                earlier_persistence,
-                len(earlier_residuals),
-            )
-            if persistence.any():
-                errors = errors[1:] - before @ persistence.T
-            return errors - errors.mean(axis=0), persistence
+        relative = y / h
+        least_variance = INTEGRATION_ERROR**2 * (relative**2).mean(axis=0)
 
         # Φ begins at that of the nominal errors: W, fitted to states that persistent errors have
         # moved, would take these for its own, and leave none that persist.
-        residuals, persistence = split(np.zeros(priors[0].size), thinning)
-        for step in [thinning] * (settings.fit_rounds - 1) + [1]:
+        mean = np.zeros(priors[0].size)
+        covariance = np.zeros((mean.size, mean.size))
+        earlier_errors = (earlier_persistence, len(earlier_residuals))
+        residuals, persistence = regression.residuals(mean, thinning, *earlier_errors)
+        steps = [thinning] * (settings.fit_rounds - 1)
+        for step in [*steps, 1]:
             # Residuals from before a change help to size the noise of a young regime.
-            known = np.concatenate([residuals, earlier_residuals])
-            noise = known.T @ known / len(known)
-            variance = np.diag(noise)
-            missing = np.maximum(least_variance - variance, 1e-9 * variance)
-            noise = noise + np.diag(missing)
+            noise = _noise(np.concatenate([residuals, earlier_residuals]), least_variance)
             # In closed loop no slope can be told from what persists: states and actions follow.
             widths = priors[-1:] if persistence.any() else priors
             # Linearised at the present c: a Gauss-Newton step.
-            rows = np.arange(0, len(inputs), step)
-            design, target = regression.linearised(c, rows)
-            if persistence.any():
-                # What persists of the error before is no news (Cochrane and Orcutt 1949).
-                design_before, target_before = regression.linearised(c, rows[1:] - 1)
-                design = design[1:] - persistence @ design_before
-                target = target[1:] - target_before @ persistence.T
+            design, target = regression.equations(c, step, persistence)
             mean, covariance = _posterior(design, target, noise, widths)
-            largest = settings.largest_parameter_error
-            c = mean[:p].clip(-largest, largest)
             # Beyond its largest error a parameter means another plant, not a fit.
+            c = mean[:p].clip(-largest_error, largest_error)
             mean[:p] = c
-            residuals, persistence = split(mean, step)
+            residuals, persistence = regression.residuals(mean, step, *earlier_errors)
 
-        residuals = np.concatenate([residuals, earlier_residuals])
-        centre = regression.centre
-        unit = regression.unit
-        return cls(features, centre, unit, mean, covariance, residuals, persistence)
+        return cls(
+            features=features,
+            centre=regression.standardisation.centre,
+            unit=regression.standardisation.unit,
+            mean=mean,
+            covariance=covariance,
+            residuals=np.concatenate([residuals, earlier_residuals]),
+            persistence=persistence,
+        )
 
     def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
         """Predictions at inputs (s, a), (M, n+m).
@@ -373,11 +514,17 @@ class EmpiricalModel:
             (M, K, p + K(1+n+m)).
         """
         p = self.features.n_parameters
-        y, G, h = self.features(inputs, self.mean[:p])
-        standardised = (inputs - self.centre) / self.unit
-        design = design_rows(G, standardised) / h[:, :, None]
-        linear_part = design[:, :, p:] @ self.mean[p:]
-        return y + h * linear_part, h, design
+        W = self.mean[p:]
+        design = self._design(inputs)
+        over_h = design.over_h
+        linear_part = over_h[:, :, p:] @ W
+        return design.y + design.h * linear_part, design.h, over_h
+
+    def _design(self, inputs: Array) -> _Design:
+        """The model at inputs (M, n+m), linear about its own parameters."""
+        c = self.mean[: self.features.n_parameters]
+        standardisation = Standardisation(self.centre, self.unit)
+        return standardisation.design(self.features, inputs, c)
 
     def nominal_prediction_error(self, inputs: Array, c: Array) -> Array:
         """Mean one-step prediction error of the nominal model, as this model knows it.
@@ -392,14 +539,16 @@ class EmpiricalModel:
         y, _, _ = self.features(inputs, c)
         # The model's own prediction stands for the plant's mean.
         predicted, _, _ = self.predict(inputs)
-        mean: Array = (predicted - y)[:, :-1].mean(axis=0)
+        errors = predicted - y
+        of_states = errors[:, :-1]
+        mean: Array = of_states.mean(axis=0)
         return mean
 
     def cost_derivative(self, inputs: Array) -> Array:
         """Derivative of the mean cost at inputs (M, n+m) by `mean`, (p + K(1+n+m),)."""
-        _, G, _ = self.features(inputs, self.mean[: self.features.n_parameters])
-        standardised = (inputs - self.centre) / self.unit
-        derivative: Array = design_rows(G, standardised)[:, -1].mean(axis=0)
+        # The cost is the last output.
+        of_cost = self._design(inputs).rows[:, -1]
+        derivative: Array = of_cost.mean(axis=0)
         return derivative
 
     @cached_property
@@ -431,10 +580,11 @@ class EmpiricalModel:
     def coefficients(self) -> tuple[Array, Array]:
         """c (p,) and W (K, 1+n+m) for inputs in their own units."""
         p = self.features.n_parameters
+        c = self.mean[:p]
         W = self.mean[p:].reshape(self.features.n_outputs, -1)
         slopes = W[:, 1:] / self.unit
         constants = W[:, 0] - slopes @ self.centre
-        return self.mean[:p], np.column_stack([constants, slopes])
+        return c, np.column_stack([constants, slopes])
 
     def state_dict(self) -> State:
         """All but the features."""
@@ -455,7 +605,8 @@ def pointers(*arrays: NDArray[Any]) -> list[ctypes.c_void_p]:
 
 def c_definitions(sizes: Mapping[str, int]) -> str:
     """A `#define` for each size."""
-    return "".join(f"#define {name} {value}\n" for name, value in sizes.items())
+    lines = [f"#define {name} {value}\n" for name, value in sizes.items()]
+    return "".join(lines)
 
 
 def design_rows(G: Array, standardised: Array) -> Array:
@@ -473,10 +624,22 @@ def design_rows(G: Array, standardised: Array) -> Array:
     q = inputs.shape[1]
     design = np.zeros((M, K, p + K * q))
     design[:, :, :p] = G
+    # Each output has a row of W of its own.
     for i in range(K):
         first = p + i * q
-        design[:, i, first : first + q] = inputs
+        last = first + q
+        design[:, i, first:last] = inputs
     return design
+
+
+def _noise(residuals: Array, least_variance: Array) -> Array:
+    """Covariance of residuals (M, K), (K, K), each variance at least its least, (K,)."""
+    noise: Array = residuals.T @ residuals / len(residuals)
+    variance = np.diag(noise)
+    # A little in any case, since outputs may be multiples of each other.
+    missing = np.maximum(least_variance - variance, 1e-9 * variance)
+    noise += np.diag(missing)
+    return noise
 
 
 def _priors(
@@ -487,12 +650,14 @@ def _priors(
 ) -> list[Array]:
     """Prior deviations of (c, W), one array for each width of W's slopes."""
     # Of an output that the nominal model knows exactly, W stays near zero.
-    deviation = errors.std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
+    size = np.abs(y).mean(axis=0)
+    deviation = errors.std(axis=0) + 1e-9 * size
     parameters = np.full(features.n_parameters, settings.parameter_deviation)
     priors = []
     for slope in sorted(settings.slope_deviations, reverse=True):
-        row = [1.0] + [slope] * features.n_inputs
-        priors.append(np.append(parameters, np.outer(deviation, row)))
+        slopes = [slope] * features.n_inputs
+        W = np.outer(deviation, [1.0, *slopes])
+        priors.append(np.append(parameters, W))
     return priors
 
 
@@ -502,10 +667,13 @@ def _triangle(rows: Array) -> Array:
     Some outputs are nearly exact, others noisy: normal equations would lose the latter. Blocks that
     fit in a processor's cache are factored first, which takes a third of the time.
     """
-    whole = len(rows) // BLOCK * BLOCK
-    blocks = rows[:whole].reshape(-1, BLOCK, rows.shape[1])
+    n_blocks = len(rows) // BLOCK
+    n_whole = n_blocks * BLOCK
+    whole = rows[:n_whole]
+    rest = rows[n_whole:]
+    blocks = whole.reshape(n_blocks, BLOCK, rows.shape[1])
     triangles = np.linalg.qr(blocks, mode="r")
-    stacked = np.concatenate([*triangles, rows[whole:]])
+    stacked = np.concatenate([*triangles, rest])
     return np.asarray(np.linalg.qr(stacked, mode="r"))
 
 
@@ -524,21 +692,31 @@ def _posterior(
         priors: deviations (q,) to choose from.
     """
     # Whitened outputs have independent errors of one size.
-    whiten = np.linalg.inv(np.linalg.cholesky(noise))
-    white_design = (whiten @ design).reshape(-1, design.shape[2])
-    white_target = (target @ whiten.T).reshape(-1)
-    R = _triangle(np.column_stack([white_design, white_target]))
+    cholesky = np.linalg.cholesky(noise)
+    whiten = np.linalg.inv(cholesky)
+    white_design = whiten @ design
+    white_target = target @ whiten.T
+    equations = np.column_stack(
+        [
+            white_design.reshape(-1, design.shape[2]),
+            white_target.reshape(-1),
+        ]
+    )
+    R = _triangle(equations)
+    R_design = R[:, :-1]
+    R_target = R[:, -1]
     greatest = -np.inf
     best: tuple[Array, Array] | None = None
     for prior in priors:
         # The prior as further rows: a ridge regression by QR.
-        data_rows = R[:, :-1] * prior
+        data_rows = R_design * prior
         prior_rows = np.eye(prior.size)
         Q, root = np.linalg.qr(np.concatenate([data_rows, prior_rows]))
-        moment = Q[: len(R)].T @ R[:, -1]
+        moment = Q[: len(R)].T @ R_target
         factor = prior[:, None] * np.linalg.inv(root)
         # Evidence: how well the data are explained, less what the fit could have explained.
-        log_determinant = np.log(np.abs(np.diag(root))).sum()
+        diagonal = np.abs(np.diag(root))
+        log_determinant = np.log(diagonal).sum()
         evidence = float(moment @ moment / 2 - log_determinant)
         if best is None or evidence > greatest:
             greatest = evidence

@@ -11,18 +11,18 @@ import numpy as np
 
 from cosim.core.protocols import Array
 
-LARGEST_PERSISTENCE = 0.99
-"""Largest spectral radius of Φ: errors that last for 100 samples. What lasts longer is a mean."""
 DOUBLINGS = 12
 """Rounds of the sum Γ, 2¹² terms: at the largest radius what is left out is below rounding."""
 
 
-def estimated(
+def estimate_persistence(
     later: Array,
     before: Array,
-    doubt: float,
     earlier: Array,
     n_earlier: int,
+    *,
+    doubt: float,
+    largest: float = 0.99,
 ) -> Array:
     """Φ by least squares; zero where independent errors would look like it.
 
@@ -32,43 +32,53 @@ def estimated(
     Args:
         later: r₊, (M, K).
         before: r, (M, K).
-        doubt: standard deviations by which the ratio must exceed its mean.
         earlier: an earlier estimate of Φ, (K, K), which counts as if it came from these errors.
         n_earlier: number of errors of which that was one.
+        doubt: standard deviations by which the ratio must exceed its mean.
+        largest: largest spectral radius of Φ; errors that last longer are a mean.
 
     Returns:
-        Φ, (K, K), of spectral radius `LARGEST_PERSISTENCE` at most.
+        Φ, (K, K).
     """
     later = later - later.mean(axis=0)
     before = before - before.mean(axis=0)
-    K = before.shape[1]
+    count, K = before.shape
     # In units of their size; an output without errors has none that persist.
     size = before.std(axis=0)
     size = np.where(size > 0, size, 1.0)
     scaled_later = later / size
     scaled_before = before / size
-    solution = np.linalg.lstsq(scaled_before, scaled_later, rcond=1e-8)[0]
-    weight = n_earlier / (len(before) + n_earlier)
+    solution, *_ = np.linalg.lstsq(scaled_before, scaled_later, rcond=1e-8)
+    weight = n_earlier / (count + n_earlier)
     scaled_earlier = earlier.T * size[:, None] / size
     solution = (1 - weight) * solution + weight * scaled_earlier
+
     # Log-likelihoods of normal errors, with and without what persists.
     innovations = scaled_later - scaled_before @ solution
-    ratio = len(before) * (_log_determinant(scaled_later) - _log_determinant(innovations))
-    if ratio <= K**2 + doubt * (2 * K**2) ** 0.5 and not weight:
+    gain = _log_determinant(scaled_later) - _log_determinant(innovations)
+    ratio = count * gain
+    degrees = K**2
+    deviation = (2 * degrees) ** 0.5
+    if ratio <= degrees + doubt * deviation and not weight:
         return np.zeros((K, K))
+
     persistence: Array = (solution / size[:, None] * size).T
-    return persistence * min(1.0, LARGEST_PERSISTENCE / max(_radius(persistence), 1e-9))
+    radius = max(_radius(persistence), 1e-9)
+    return persistence * min(1.0, largest / radius)
 
 
 def _log_determinant(values: Array) -> float:
     """Log of the determinant of the covariance of values (M, K), of mean zero."""
     covariance = values.T @ values / len(values)
     floor = 1e-12 * np.eye(len(covariance))
-    return float(np.linalg.slogdet(covariance + floor)[1])
+    _, logarithm = np.linalg.slogdet(covariance + floor)
+    return float(logarithm)
 
 
 def _radius(persistence: Array) -> float:
-    return float(np.abs(np.linalg.eigvals(persistence)).max())
+    """The spectral radius."""
+    eigenvalues = np.linalg.eigvals(persistence)
+    return float(np.abs(eigenvalues).max())
 
 
 def error_covariance(persistence: Array, innovations: Array) -> Array:
@@ -110,7 +120,9 @@ def mean_error_covariance(persistence: Array, innovations: Array, count: int) ->
     power = np.linalg.matrix_power(persistence, count)
     remainder = persistence @ (one - power) @ inverse @ inverse / count
     total = persistence @ inverse - remainder
-    covariance: Array = (gamma + total @ gamma + gamma @ total.T) / count
+    later = total @ gamma
+    earlier = gamma @ total.T
+    covariance: Array = (gamma + later + earlier) / count
     return covariance
 
 

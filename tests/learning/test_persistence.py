@@ -6,7 +6,7 @@ import pytest
 from learning.persistence import (
     effective_number,
     error_covariance,
-    estimated,
+    estimate_persistence,
     mean_error_covariance,
 )
 
@@ -26,17 +26,19 @@ def autoregression(rng, count, phi):
 
 def test_the_autoregression_is_found(rng):
     errors = autoregression(rng, 20_000, PHI)
-    assert estimated(errors[1:], errors[:-1], 4.0, NONE, 0) == pytest.approx(PHI, abs=0.03)
+    assert estimate_persistence(errors[1:], errors[:-1], NONE, 0, doubt=4.0) == pytest.approx(
+        PHI, abs=0.03
+    )
 
 
 def test_independent_errors_do_not_persist(rng):
     errors = autoregression(rng, 500, NONE)
-    assert not estimated(errors[1:], errors[:-1], 4.0, NONE, 0).any()
+    assert not estimate_persistence(errors[1:], errors[:-1], NONE, 0, doubt=4.0).any()
 
 
 def test_an_earlier_estimate_counts_like_errors_seen_here(rng):
     errors = autoregression(rng, 21, NONE)
-    found = estimated(errors[1:], errors[:-1], 4.0, PHI, 2000)
+    found = estimate_persistence(errors[1:], errors[:-1], PHI, 2000, doubt=4.0)
     assert found == pytest.approx(PHI, abs=0.02)
 
 

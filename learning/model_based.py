@@ -165,7 +165,7 @@ class ModelBased(Algorithm):
         self._features = Features(self._problem, settings.smallest_error_size)
         # Of the fitted parameters only those that θ has reach the controller.
         labels = start.blocks.block("p").labels if "p" in start.blocks else ()
-        self._carried = self._problem.model.parameter_indices(labels)  # parameters that θ has
+        self._carried = self._problem.model.parameter_indices(labels)
         self._rollout = Rollout(self._problem, start, self._features)
         self._data = PlantData(self._features, settings)
         # A start that is backed off already is not given away.
@@ -219,7 +219,8 @@ class ModelBased(Algorithm):
         """Back-offs of θ from the true bounds, lower then upper ones, (2n,)."""
         lower = theta["x_l"] - self._base["x_l"]
         upper = self._base["x_u"] - theta["x_u"]
-        back_offs: Array = np.maximum(np.concatenate([lower, upper]), 0.0)
+        distances = np.concatenate([lower, upper])
+        back_offs: Array = np.maximum(distances, 0.0)
         return back_offs
 
     def alarmed(self, model: EmpiricalModel) -> bool:
@@ -234,47 +235,53 @@ class ModelBased(Algorithm):
         too_costly = []
         if len(costs) > settings.settling_samples:
             for window, limit in zip(settings.change_windows, self._limits, strict=True):
-                if window <= len(costs) and costs[-window:].mean() > limit:
+                latest = costs[-window:]
+                if window <= len(costs) and latest.mean() > limit:
                     too_costly.append(window)
-        return self._data.changed(predictions, too_costly) or bool(too_costly)
+        changed = self._data.changed(predictions, too_costly)
+        return changed or bool(too_costly)
 
     def _update(self, alarmed: bool) -> Update:
         """Fit the model, search on it, and move θ where the model predicts less for the new one."""
         settings = self.configuration
         data = self._data
         present = self.controller.parameters
+        blocks = present.blocks
+        soon = data.count + settings.change_windows[-2]
         model = self._fitted()
         if model is None:
             # A plant that has run away leaves no model: ask again soon.
-            self._due = data.count + settings.change_windows[-2]
-            stays = update_without_fit(present.blocks, present.theta, present.theta, refused=True)
+            self._due = soon
+            stays = update_without_fit(blocks, present.theta, present.theta, refused=True)
             return stays._replace(lost=True)
-        inputs, _ = data.present
-        if data.regime_start != self._regime_start:
-            # A regime that was young itself had a floor of before.
-            young = data.regime_start - self._regime_start < settings.steady_samples
-            floored = young and self._regime_start > 0
-            self._floor = np.minimum(self._floor, self.back_off) if floored else self.back_off
-            self._regime_start = data.regime_start
+        self._begin_regime()
         # Day by day an optimum moves little: then the search begins at the present back-offs.
         # Without limits the present cost was never predicted.
         known = bool(np.isfinite(self._limits).all())
         settled = data.age > settings.longest_interval and not alarmed and known
+        levels = () if settled else settings.back_off_levels
+        # Data double between updates, then grow by a share.
         longest = max(settings.longest_interval, data.age // settings.refit_growth)
         interval = min(data.age, longest)
-        # Data double between updates, then grow by a share.
         self._due = data.count + max(interval, settings.first_update)
 
+        inputs, _ = data.present
         latest, _ = data.latest(settings.recent_samples)
-        base, gained = self.corrected(present, model, inputs[-settings.recent_samples :])
+        recent = inputs[-settings.recent_samples :]
+        base, gained = self.corrected(present, model, recent)
         # What c_f and the parameters correct, back-offs need not hold any more.
         shift = np.concatenate([gained, -gained])
         kept = np.maximum(self.back_off + shift, 0.0)
         least = self.least_back_offs(kept, inputs)
         search = BackOffOnModel(
-            self._problem, self._rollout, base, model, latest, settings, self.rng
+            self._problem,
+            self._rollout,
+            base,
+            model,
+            latest,
+            settings,
+            self.rng,
         )
-        levels = () if settled else settings.back_off_levels
         best = search.best(kept, least, levels)
 
         # The comparison that decides meets noise that no search has seen.
@@ -283,19 +290,33 @@ class ModelBased(Algorithm):
         cost_of_new, cost_of_present = search.predicted_costs([new, present.theta])
         least_gain = search.doubt if model.persistence.any() else 0.0
         better = search.excess(cost_of_new, cost_of_present) <= -least_gain
-        self._limits = (cost_of_new if better else cost_of_present).limits
-        self.predicted_cost = (cost_of_new if better else cost_of_present).cost
+        prediction = cost_of_new if better else cost_of_present
+        self._limits = prediction.limits
+        self.predicted_cost = prediction.cost
         if better:
             self.back_off = best
             self.controller.theta = new
         lost = not np.isfinite(self._limits).all()
         if lost:
             # Nothing is known of any cost: look again soon.
-            self._due = min(self._due, data.count + settings.change_windows[-2])
+            self._due = min(self._due, soon)
         self.model_samples += search.n_samples
         end = self.controller.theta
-        update = update_without_fit(present.blocks, present.theta, end, refused=not better)
+        update = update_without_fit(blocks, present.theta, end, refused=not better)
         return update._replace(lost=lost)
+
+    def _begin_regime(self) -> None:
+        """After a change of the plant: keep the back-offs of before, as a floor."""
+        began = self._data.regime_start
+        if began == self._regime_start:
+            return
+        # A regime that was young itself had a floor of before.
+        young = began - self._regime_start < self.configuration.steady_samples
+        if young and self._regime_start > 0:
+            self._floor = np.minimum(self._floor, self.back_off)
+        else:
+            self._floor = self.back_off
+        self._regime_start = began
 
     def _fitted(self) -> EmpiricalModel | None:
         """The model of the present plant; None where its data or predictions are not finite."""
@@ -308,8 +329,10 @@ class ModelBased(Algorithm):
                 predicted, h, _ = model.predict(latest)
         except np.linalg.LinAlgError:
             return None
-        finite = np.isfinite(predicted).all() and np.isfinite(h).all()
-        return model if finite and np.isfinite(model.noise).all() else None
+        for values in (predicted, h, model.noise):
+            if not np.isfinite(values).all():
+                return None
+        return model
 
     def least_back_offs(self, present: Array, inputs: Array) -> Array:
         """Least back-offs that the data allow.
@@ -335,8 +358,8 @@ class ModelBased(Algorithm):
         above = states - problem.state_lower
         below = problem.state_upper - states
         distances = np.concatenate([above, below], axis=1)
-        closest = distances.min(axis=0)
-        least: Array = np.clip(settings.shrink_share * closest, floor, present)
+        shown = settings.shrink_share * distances.min(axis=0)
+        least: Array = np.clip(shown, floor, present)
         return least
 
     def corrected(
@@ -367,14 +390,16 @@ class ModelBased(Algorithm):
         before = np.zeros(self._features.n_parameters)
         after = np.zeros(self._features.n_parameters)
         if "p" in kept:
-            nominal = self._problem.model.nominal_parameters[self._carried]
-            before[self._carried] = kept["p"] / nominal - 1
-            after[self._carried] = model.mean[self._carried]
-            kept["p"] = nominal * (1 + after[self._carried])
+            carried = self._carried
+            nominal = self._problem.model.nominal_parameters[carried]
+            fitted = model.mean[carried]
+            before[carried] = kept["p"] / nominal - 1
+            after[carried] = fitted
+            kept["p"] = nominal * (1 + fitted)
         # Offset-free: what the controller's model still lacks on average.
         kept["c_f"] = model.nominal_prediction_error(inputs, after)
-        gained = model.nominal_prediction_error(inputs, before) - present["c_f"]
-        return self._base.replace(kept), gained
+        error_before = model.nominal_prediction_error(inputs, before)
+        return self._base.replace(kept), error_before - present["c_f"]
 
     def state_dict(self) -> State:
         """Back-offs, schedule, limits and data."""
@@ -443,11 +468,13 @@ class ExpectedCosts:
             Costs (M,), and the penalty of each bound in them, (2n, M).
         """
         states = predicted[:, :-1]
+        stage_costs = predicted[:, -1]
         sizes = self._widened * h
         due = expected_penalties(self.penalty, states, self._errors, sizes)
         # From (state, bound) to lower bounds and then upper ones, as back-offs are.
-        penalties = due.swapaxes(0, 1).reshape(-1, len(predicted))
-        return predicted[:, -1] + penalties.sum(axis=0), penalties
+        by_bound = due.swapaxes(0, 1)
+        penalties = by_bound.reshape(-1, len(predicted))
+        return stage_costs + penalties.sum(axis=0), penalties
 
 
 class BackOffOnModel:
@@ -494,15 +521,17 @@ class BackOffOnModel:
         self._costs = ExpectedCosts(problem, model, settings)
         predicted, h, _ = model.predict(visited)
         # What no sample of the plant has cost, a rollout does not know.
-        self._largest_cost = self._costs(predicted, h)[0].max()
+        visited_costs, _ = self._costs(predicted, h)
+        self._largest_cost = visited_costs.max()
         states = visited[:, :n]
-        self._start = visited[-1, :n]
+        self._start = states[-1]
         self._centre = states.mean(axis=0)
         self._reach = settings.state_ranges * np.ptp(states, axis=0)
         if len(visited) < settings.recent_samples:
             self._reach[:] = np.inf  # the plant has not settled yet
         # The size of a one-step error, at least a millionth of the state's own unit.
-        deviation = model.error_deviation[:n] * h[:, :n].mean(axis=0)
+        size = h.mean(axis=0)
+        deviation = model.error_deviation[:n] * size[:n]
         deviation = np.maximum(deviation, 1e-6 * problem.units.state)
         self.unit = np.tile(deviation, 2)
         distance = problem.state_upper - problem.state_lower
@@ -532,53 +561,69 @@ class BackOffOnModel:
 
     def predicted_costs(self, thetas: Sequence[Array]) -> list[PredictedCost]:
         """What the model predicts of each θ, (n_θ,) each; infinite where the rollout is lost."""
+        keys = [theta.tobytes() for theta in thetas]
         new = {}
-        for theta in thetas:
-            key = theta.tobytes()
+        for key, theta in zip(keys, thetas, strict=True):
             if key not in self._known:
                 new[key] = theta
-        rollouts = self._rollout(list(new.values()), self._start, self._model, self._picks)
+        rollouts = self._rollout(
+            list(new.values()),
+            self._start,
+            self._model,
+            self._picks,
+        )
         for key, samples in zip(new, rollouts, strict=True):
             self._known[key] = self._predicted_cost(samples)
-        return [self._known[theta.tobytes()] for theta in thetas]
+        return [self._known[key] for key in keys]
 
     def _predicted_cost(self, samples: RolloutSamples) -> PredictedCost:
+        """What the samples of a rollout say of its θ."""
         settings = self._settings
         self.n_samples += len(samples.inputs)
+        # A rollout counts once it has settled.
         inputs = samples.inputs[settings.burn_in :]
         predicted = samples.predicted[settings.burn_in :]
         h = samples.h[settings.burn_in :]
-        windows = settings.change_windows
-        derivative = np.zeros_like(self._model.mean)
-        lost = PredictedCost(np.inf, derivative, np.full(len(windows), np.inf))
         complete = len(inputs) >= len(self._picks) - settings.burn_in
         if not complete or not np.isfinite(predicted).all():
-            return lost
-        # A rollout counts once it has settled.
+            return self._lost
         with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
             costs, penalties = self._costs(predicted, h)
         cost = float(costs.mean())
         if not np.isfinite(cost):
-            return lost
+            return self._lost
+        # A bound shows in lost rollouts too.
         stage_cost = float(predicted[:, -1].mean())
         size = max(abs(stage_cost), np.finfo(np.float64).eps)
-        # A bound shows in lost rollouts too.
         penalty_share = penalties.mean(axis=1) / size
         self._penalty_share = np.maximum(self._penalty_share, penalty_share)
-        mean_state = inputs[:, : len(self._start)].mean(axis=0)
+        n = self._problem.n_states
+        mean_state = inputs[:, :n].mean(axis=0)
         away = np.abs(mean_state - self._centre)
         if cost > self._largest_cost or (away > self._reach).any():
-            return lost
-        # What the plant may cost before the prediction is called wrong.
+            return self._lost
+        some_inputs = inputs[:: settings.cost_thinning]
+        derivative = self._model.cost_derivative(some_inputs)
+        return PredictedCost(cost, derivative, self._limits_of(costs))
+
+    def _limits_of(self, costs: Array) -> Array:
+        """What the plant may cost before a prediction (M,) is called wrong, for each window."""
+        settings = self._settings
+        cost = float(costs.mean())
         worst = []
-        for window in windows:
+        for window in settings.change_windows:
             means = _moving_mean(costs, window)
             worst.append(means.max(initial=cost))
         excess = np.array(worst) - cost
-        limits = cost + settings.cost_excess * excess
-        some_inputs = inputs[:: settings.cost_thinning]
-        derivative = self._model.cost_derivative(some_inputs)
-        return PredictedCost(cost, derivative, limits)
+        limits: Array = cost + settings.cost_excess * excess
+        return limits
+
+    @property
+    def _lost(self) -> PredictedCost:
+        """What is predicted of a rollout that is lost."""
+        derivative = np.zeros_like(self._model.mean)
+        limits = np.full(len(self._settings.change_windows), np.inf)
+        return PredictedCost(np.inf, derivative, limits)
 
     def excess(self, one: PredictedCost, other: PredictedCost) -> float:
         """Cost of one above another's, in deviations of what the model knows of the difference."""
@@ -589,7 +634,8 @@ class BackOffOnModel:
         variance = float(derivative @ self._model.covariance @ derivative)
         least = self._settings.plateau * abs(one.cost)
         deviation = max(variance**0.5, least)
-        return float((one.cost - other.cost) / deviation)
+        difference = one.cost - other.cost
+        return float(difference / deviation)
 
     def best(
         self,
@@ -665,9 +711,9 @@ class BackOffOnModel:
         wanted = [self.unit[i]]
         if delta[i]:
             wanted = [delta[i] * factor for factor in factors]
-        values = self._rounded(i, [max(value, least) for value in wanted])
+        allowed = [max(value, least) for value in wanted]
         points = [delta]
-        for value in values:
+        for value in self._rounded(i, allowed):
             points.append(_with(delta, [i], [value]))
         return self._cheapest(points)
 
@@ -675,30 +721,36 @@ class BackOffOnModel:
         """δ with as much of the reserve back-off of a bound that is not active as costs nothing."""
         # Half of it, then all: the largest that costs nothing.
         reserve = self._settings.reserve_back_off * self.unit[i]
+        wanted = [0.5 * reserve, reserve]
         points = [delta]
-        for value in self._rounded(i, [0.5 * reserve, 1.0 * reserve]):
+        for value in self._rounded(i, wanted):
             if value > delta[i]:
                 points.append(_with(delta, [i], [value]))
-        costs = self.predicted_costs([self.theta(point) for point in points])
+        thetas = [self.theta(point) for point in points]
+        costs = self.predicted_costs(thetas)
+        without = costs[0]
         free = delta
         for point, cost in zip(points, costs, strict=True):
-            if self.excess(cost, costs[0]) <= self.doubt:
+            if self.excess(cost, without) <= self.doubt:
                 free = point
         return free
 
     def _rounded(self, i: int, values: Sequence[float]) -> list[float]:
         """Back-offs of a bound as multiples of its step, within its room, ascending."""
         # A twentieth of the error's order of magnitude.
-        step = 10.0 ** np.floor(np.log10(self.unit[i])) / 20
+        magnitude = np.floor(np.log10(self.unit[i]))
+        step = 10.0**magnitude / 20
         rounded = set()
         for value in values:
             multiple = round(value / step) * step
-            rounded.add(float(min(multiple, self._most[i])))
+            within = min(multiple, self._most[i])
+            rounded.add(float(within))
         return sorted(rounded)
 
     def _cheapest(self, points: Sequence[Array]) -> Array:
         """The smallest of the points whose cost the model cannot tell from the least one."""
-        costs = self.predicted_costs([self.theta(point) for point in points])
+        thetas = [self.theta(point) for point in points]
+        costs = self.predicted_costs(thetas)
         least = min(costs, key=lambda predicted: predicted.cost)
         # Of what the model cannot tell apart, the smallest back-off.
         close = []
@@ -707,15 +759,18 @@ class BackOffOnModel:
                 close.append(point)
 
         def size(point: Array) -> float:
-            return float((point / self.unit).sum())
+            in_units = point / self.unit
+            return float(in_units.sum())
 
         return min(close or points[:1], key=size)
 
 
 def _moving_mean(costs: Array, window: int) -> Array:
     """Means of so many costs in a row."""
-    total: Array = np.concatenate([[0.0], costs]).cumsum()
-    return (total[window:] - total[:-window]) / window
+    with_zero = np.concatenate([[0.0], costs])
+    total: Array = with_zero.cumsum()
+    sums = total[window:] - total[:-window]
+    return sums / window
 
 
 def _with(

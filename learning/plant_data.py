@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +58,8 @@ class PlantData:
         self.changes = 0
         self.count_at_fit = 0
         # A ring of transitions (s, a, s₊, ℓ).
-        self._rows = np.zeros((settings.memory, features.n_inputs + features.n_outputs))
+        width = features.n_inputs + features.n_outputs
+        self._rows = np.zeros((settings.memory, width))
         self._earlier: EmpiricalModel | None = None  # from before the last change of the plant
         # Of the samples since the fit, a block for each `change_windows[0]` of them.
         self._blocks: list[Predictions] = []
@@ -65,17 +67,26 @@ class PlantData:
     def add(self, transition: Transition) -> None:
         """Keep a transition in place of the oldest one."""
         stage_cost = np.array([transition.stage_cost])
-        row = [transition.s, transition.a, transition.next_s, stage_cost]
-        self._rows[self.count % len(self._rows)] = np.concatenate(row)
+        oldest = self.count % len(self._rows)
+        self._rows[oldest] = np.concatenate(
+            [
+                transition.s,
+                transition.a,
+                transition.next_s,
+                stage_cost,
+            ]
+        )
         self.count += 1
 
     def latest(self, count: int) -> tuple[Array, Array]:
         """Inputs (s, a) and outputs (s₊, ℓ) of so many of the latest samples, oldest first."""
-        count = min(count, self.count, len(self._rows))
+        size = len(self._rows)
+        count = min(count, self.count, size)
         # The ring as time has it.
-        where = np.arange(self.count - count, self.count) % len(self._rows)
-        rows = self._rows[where]
-        return rows[:, : self.features.n_inputs], rows[:, self.features.n_inputs :]
+        samples = np.arange(self.count - count, self.count)
+        rows = self._rows[samples % size]
+        n_inputs = self.features.n_inputs
+        return rows[:, :n_inputs], rows[:, n_inputs:]
 
     @property
     def age(self) -> int:
@@ -122,19 +133,19 @@ class PlantData:
         if n_latest < self.settings.forecast_samples:
             return 0
         n_older = (len(inputs) - n_latest) // 2
+        with_older = slice(0, -n_latest)
+        without = slice(n_older, -n_latest)
         models = []
-        for first in (0, n_older):
-            part = slice(first, -n_latest)
-            models.append(
-                EmpiricalModel.fit(self.features, inputs[part], outputs[part], self.settings)
-            )
-        # Both are judged by the noise of the newer model, and by as many errors as are independent.
-        precision = np.linalg.pinv(models[1].error_covariance)
-        share = models[1].effective_number(n_latest) / n_latest
+        for part in (with_older, without):
+            model = EmpiricalModel.fit(self.features, inputs[part], outputs[part], self.settings)
+            models.append(model)
+        # Both meet the noise of the newer model, and as many errors as are independent.
+        newer = models[1]
+        precision = np.linalg.pinv(newer.error_covariance)
+        share = newer.effective_number(n_latest) / n_latest
         losses = []
         for model in models:
-            predicted, h, _ = model.predict(inputs[-n_latest:])
-            errors = (outputs[-n_latest:] - predicted) / h
+            _, _, errors, _ = _compare(model, inputs[-n_latest:], outputs[-n_latest:])
             squares = float(np.einsum("mi,ij,mj->", errors, precision, errors))
             losses.append(share * squares / 2)
         evidence = losses[0] - losses[1]
@@ -146,25 +157,27 @@ class PlantData:
         Of as many of the latest ones as the longest window has, at most; a last part shorter than
         the shortest window is left out.
         """
-        assert self.model is not None
+        model = self.model
+        assert model is not None
         windows = self.settings.change_windows
         block = windows[0]
         # Blocks that are known need not be predicted again.
         new = self.since_fit - block * len(self._blocks)
         # One more, if there is one: its error persists in part.
         inputs, outputs = self.latest(new + 1)
-        for first in range(len(inputs) - new, len(inputs) - block + 1, block):
+        count = len(inputs)
+        for first in range(count - new, count - block + 1, block):
             part = slice(first, first + block)
-            predicted, h, designs = self.model.predict(inputs[part])
-            errors = (outputs[part] - predicted) / h
-            if first > 0 and self.model.persistence.any():
+            predictions = _compare(model, inputs[part], outputs[part])
+            if first > 0 and model.persistence.any():
                 before = slice(first - 1, first)
-                predicted_before, h_before, _ = self.model.predict(inputs[before])
-                error_before = (outputs[before] - predicted_before) / h_before
-                errors_before = np.concatenate([error_before, errors[:-1]])
-                predicted = predicted + h * (errors_before @ self.model.persistence.T)
-            self._blocks.append(Predictions(predicted, h, errors, designs))
-        latest = self._blocks[-windows[-1] // block :]
+                _, _, error_before, _ = _compare(model, inputs[before], outputs[before])
+                errors_before = np.concatenate([error_before, predictions.errors[:-1]])
+                persisting = predictions.h * (errors_before @ model.persistence.T)
+                predictions = predictions._replace(outputs=predictions.outputs + persisting)
+            self._blocks.append(predictions)
+        n_latest = ceil(windows[-1] / block)
+        latest = self._blocks[-n_latest:]
         columns = [np.concatenate(column) for column in zip(*latest, strict=True)]
         return Predictions(*columns)
 
@@ -187,12 +200,16 @@ class PlantData:
         for window in self.settings.change_windows:
             if window > len(predictions.errors):
                 break
-            mean = predictions.errors[-window:].mean(axis=0)
-            design = predictions.designs[-window:].mean(axis=0)
-            covariance = model.mean_error_covariance(window)
-            covariance = covariance + design @ model.covariance @ design.T
-            # Hotelling's T², of the mean's own noise and of what the model does not know.
-            statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
+            errors = predictions.errors[-window:]
+            designs = predictions.designs[-window:]
+            mean = errors.mean(axis=0)
+            design = designs.mean(axis=0)
+            # Of the mean's own noise and of what the model does not know.
+            noise = model.mean_error_covariance(window)
+            doubt = design @ model.covariance @ design.T
+            squares = mean @ np.linalg.solve(noise + doubt, mean)
+            # T² has an F distribution after this factor, of K and M − K degrees of freedom.
+            statistic = squares * (M - K) / (K * (M - 1))
             probability = fdtrc(K, M - K, max(statistic, 0.0))
             limit = self.settings.change_probability
             if window in suspect:
@@ -215,9 +232,10 @@ class PlantData:
             "changes": self.changes,
             "count_at_fit": self.count_at_fit,
         }
-        for name, model in (("model", self.model), ("earlier", self._earlier)):
-            if model is not None:
-                state |= prefixed(name, model.state_dict())
+        if self.model is not None:
+            state |= prefixed("model", self.model.state_dict())
+        if self._earlier is not None:
+            state |= prefixed("earlier", self._earlier.state_dict())
         return state
 
     def load_state_dict(self, state: State) -> None:
@@ -228,8 +246,18 @@ class PlantData:
         self.changes = state["changes"]
         self.count_at_fit = state["count_at_fit"]
         self._blocks = []
-        # Before the first fit there is no model, before the first change no earlier one.
-        model = part_of(state, "model")
-        self.model = EmpiricalModel(self.features, **model) if model else None
-        earlier = part_of(state, "earlier")
-        self._earlier = EmpiricalModel(self.features, **earlier) if earlier else None
+        self.model = self._restored(part_of(state, "model"))
+        self._earlier = self._restored(part_of(state, "earlier"))
+
+    def _restored(self, state: State) -> EmpiricalModel | None:
+        """The model of this state; None before the first fit, or the first change."""
+        if not state:
+            return None
+        return EmpiricalModel(self.features, **state)
+
+
+def _compare(model: EmpiricalModel, inputs: Array, outputs: Array) -> Predictions:
+    """Predictions of a model at inputs (T, n+m), beside what came of them, (T, K)."""
+    predicted, h, designs = model.predict(inputs)
+    errors = (outputs - predicted) / h
+    return Predictions(predicted, h, errors, designs)

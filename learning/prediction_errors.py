@@ -29,21 +29,23 @@ class OneStepModel:
 
     def __init__(self, scenario: Scenario) -> None:
         problem = Problem.from_scenario(scenario)
+        model = problem.model
         self._problem = problem
-        self._model = problem.model
+        self._model = model
         self.n_states = problem.n_states
-        step = discretise(self._model, problem.sampling_time, problem.substeps)
+        simulate = discretise(model, problem.sampling_time, problem.substeps)
         x = ca.SX.sym("x", problem.n_states)
         u = ca.SX.sym("u", problem.n_actions)
-        p = ca.SX.sym("p", len(self._model.parameters))
-        d = ca.DM(self._model.nominal_disturbance)
-        nominal = ca.DM(self._model.nominal_parameters)
+        p = ca.SX.sym("p", len(model.parameters))
+        d = ca.DM(model.nominal_disturbance)
+        p_nominal = ca.DM(model.nominal_parameters)
         # Two functions: that of the nominal parameters is called in every sample.
-        nominal_step = step(x, u, d, nominal)
-        self._nominal = StackedFunction(define("f", {"x": x, "u": u}, {"y": nominal_step}))
-        parametric_step = step(x, u, d, p)
-        inputs = {"x": x, "u": u, "p": p}
-        self._parametric = StackedFunction(define("f", inputs, {"y": parametric_step}))
+        y_nominal = simulate(x, u, d, p_nominal)
+        y = simulate(x, u, d, p)
+        nominal = define("f", {"x": x, "u": u}, {"y": y_nominal})
+        parametric = define("f", {"x": x, "u": u, "p": p}, {"y": y})
+        self._nominal = StackedFunction(nominal)
+        self._parametric = StackedFunction(parametric)
 
     def __call__(self, s: Vector, a: Vector) -> Vector:
         """Prediction for state s (n,) and action a (m,)."""
@@ -57,9 +59,11 @@ class OneStepModel:
     def slowest(self) -> float:
         """Samples of f's slowest time constant at the reference, 1000 at most."""
         # A continuous pole −1/T is a discrete one of 1 − 1/T samples, to first order.
-        A = linear_model(self._problem)[0]
-        largest = np.abs(np.linalg.eigvals(A)).max()
-        return float(1.0 / max(1.0 - largest, 1.0 / LONGEST_TIME_CONSTANT))
+        A, _ = linear_model(self._problem)
+        eigenvalues = np.linalg.eigvals(A)
+        rate = 1.0 - np.abs(eigenvalues).max()
+        least = 1.0 / LONGEST_TIME_CONSTANT
+        return float(1.0 / max(rate, least))
 
     def parameters(self, theta: Parameters) -> Vector:
         """All parameters of the model at θ, (n_p,): the nominal ones but for its block p."""
@@ -112,7 +116,8 @@ class OneStepModel:
         Returns:
             e, (K, n).
         """
-        predicted = self.predict(states, actions, self.parameters(theta)) + theta["c_f"]
+        parameters = self.parameters(theta)
+        predicted = self.predict(states, actions, parameters) + theta["c_f"]
         return np.atleast_2d(next_states) - predicted
 
 
@@ -128,7 +133,8 @@ def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
     """
     # Linear and quadratic in the violation of each state.
     violation = penalty.violation(states)
-    due = violation * (penalty.linear + penalty.quadratic * violation)
+    price = penalty.linear + penalty.quadratic * violation
+    due = violation * price
     return np.asarray(due.sum(axis=-1))
 
 
@@ -138,9 +144,8 @@ class SortedErrors:
     def __init__(self, errors: Matrix) -> None:
         self.errors = np.sort(errors, axis=0)
         # Running sums, so that a mean beyond any threshold is two look-ups.
-        zero = np.zeros((1, self.errors.shape[1]))
-        self._sum = np.concatenate([zero, np.cumsum(self.errors, axis=0)])
-        self._sum_of_squares = np.concatenate([zero, np.cumsum(self.errors**2, axis=0)])
+        self._sum = _running_sums(self.errors)
+        self._sum_of_squares = _running_sums(self.errors**2)
 
     def beyond(
         self,
@@ -160,20 +165,29 @@ class SortedErrors:
             Both means, (K,) each.
         """
         # Σ (t − e) = number·t − Σ e over the errors on this side of t; the square likewise.
+        count = len(self.errors)
         below = np.searchsorted(self.errors[:, i], threshold)
         number = below
         total = self._sum[below, i]
         squares = self._sum_of_squares[below, i]
         sign = 1.0
         if above:
-            number = len(self.errors) - below
+            number = count - below
             total = self._sum[-1, i] - total
             squares = self._sum_of_squares[-1, i] - squares
             sign = -1.0
-        linear = sign * (number * threshold - total) / len(self.errors)
+        sum_of_distances = number * threshold - total
         sum_of_squares = number * threshold**2 - 2.0 * threshold * total + squares
-        quadratic = sum_of_squares / len(self.errors)
-        return np.maximum(linear, 0.0), np.maximum(quadratic, 0.0)
+        # Rounding may leave less than nothing.
+        linear = np.maximum(sign * sum_of_distances / count, 0.0)
+        quadratic = np.maximum(sum_of_squares / count, 0.0)
+        return linear, quadratic
+
+
+def _running_sums(values: Matrix) -> Matrix:
+    """Sums of the first 0, 1, … M rows (M, n), (M+1, n)."""
+    zero = np.zeros((1, values.shape[1]))
+    return np.concatenate([zero, np.cumsum(values, axis=0)])
 
 
 def expected_penalties(
@@ -193,14 +207,19 @@ def expected_penalties(
     Returns:
         Penalties of the lower and the upper bound, (n, 2, K).
     """
-    costs = np.zeros((predictions.shape[1], 2, len(predictions)))
-    for i, predicted in enumerate(predictions.T):
-        h = np.ones(len(predicted)) if scales is None else scales[:, i]
+    if scales is None:
+        scales = np.ones(predictions.shape)
+    count, n = predictions.shape
+    costs = np.zeros((n, 2, count))
+    for i in range(n):
+        predicted = predictions[:, i]
+        h = scales[:, i]
         for k, bound in enumerate((penalty.lower[i], penalty.upper[i])):
             if not np.isfinite(bound):
                 continue
             # In units of h the errors are the same for all predictions.
-            first, second = errors.beyond(i, (bound - predicted) / h, above=bool(k))
+            threshold = (bound - predicted) / h
+            first, second = errors.beyond(i, threshold, above=bool(k))
             linear = penalty.linear[i] * h * first
             quadratic = penalty.quadratic[i] * h**2 * second
             costs[i, k] = linear + quadratic
@@ -227,7 +246,9 @@ class PredictionErrors:
 
     def add(self, error: Vector) -> None:
         """Keep an error (n,) in place of the oldest one."""
-        self._errors[:, self.count % self._errors.shape[1]] = error
+        _, capacity = self._errors.shape
+        oldest = self.count % capacity
+        self._errors[:, oldest] = error
         self.count += 1
 
     def expected_penalty(self, prediction: Vector) -> float:

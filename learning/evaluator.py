@@ -52,25 +52,29 @@ class Evaluator:
             self.start = _nothing_known()
             self.limit = inf
             return
-        self._controller = nmpc(run.scenario, start, run.controller)
-        self._law = measured(run.scenario, self._controller)
-        naive = Parameters.naive(Problem.from_scenario(run.scenario))
-        naive_law = measured(run.scenario, nmpc(run.scenario, naive, run.controller))
-        naive_costs = self._costs(naive_law)["J"]
-        self.baselines["naive"] = float(naive_costs.mean())
+        scenario = run.scenario
+        self._controller = nmpc(scenario, start, run.controller)
+        self._law = measured(scenario, self._controller)
+
+        # All that a training is compared with meets the same noise.
+        problem = Problem.from_scenario(scenario)
+        naive = nmpc(scenario, Parameters.naive(problem), run.controller)
+        naive_costs = self._costs(measured(scenario, naive))
+        self.baselines["naive"] = float(naive_costs["J"].mean())
         self._optimal_costs = np.full(run.evaluation_seeds, np.nan)
         if optimum is not None:
             self._optimal_costs = self._costs(optimum)["J"]
             self.baselines["optimal"] = float(self._optimal_costs.mean())
-        # All that a training is compared with meets the same noise.
         start_costs = self._costs(self._law)
         self._start_costs = start_costs["J"]
         self.start = self._metrics(start_costs)
         self._theta = start.theta
         self._evaluation = self.start
+
         # A cost may be negative (a profit): the margin is a share of its magnitude.
         worst = max(self.baselines["naive"], self.start["J"])
-        self.limit = worst + (run.divergence - 1) * abs(worst)
+        margin = (run.divergence - 1) * abs(worst)
+        self.limit = worst + margin
 
     def evaluate(self, theta: Array) -> dict[str, Any]:
         """The greedy policy at θ (n_θ,).
@@ -86,36 +90,51 @@ class Evaluator:
         # A training ends with the θ of its last row, and a rule may leave θ as it is.
         if not np.array_equal(theta, self._theta):
             self._controller.theta = theta
-            self._evaluation = self._metrics(self._costs(self._law))
+            costs = self._costs(self._law)
+            self._evaluation = self._metrics(costs)
             self._theta = theta.copy()
         return self._evaluation
 
     def _metrics(self, costs: dict[str, Array]) -> dict[str, Any]:
         """What `evaluate` returns of the indicators of the seeds, (K,) each."""
-        metrics: dict[str, Any] = {name: float(costs[name].mean()) for name in METRICS}
-        metrics["failures"] = int(costs["failures"].sum())
-        excess = regret(costs["J"], self._optimal_costs)
-        gap = gap_closed(costs["J"], self._start_costs, self._optimal_costs)
-        difference = cost_difference(costs["J"], self._start_costs)
-        metrics["difference"] = difference.value
-        metrics["difference_interval"] = difference.interval
-        known = isfinite(excess.value)
-        metrics["regret"] = excess.value if known else None
-        metrics["regret_interval"] = excess.interval
+        J = costs["J"]
+        excess = regret(J, self._optimal_costs)
         # A start that is the optimum leaves no gap.
-        metrics["gap_closed"] = gap.value if isfinite(gap.value) else None
-        return metrics
+        gap = gap_closed(J, self._start_costs, self._optimal_costs)
+        difference = cost_difference(J, self._start_costs)
+        means: dict[str, Any] = {name: float(costs[name].mean()) for name in METRICS}
+        means["failures"] = int(costs["failures"].sum())
+        return {
+            **means,
+            "difference": difference.value,
+            "difference_interval": difference.interval,
+            "regret": _if_known(excess.value),
+            "regret_interval": excess.interval,
+            "gap_closed": _if_known(gap.value),
+        }
 
     def _costs(self, policy: Controller) -> dict[str, Array]:
         """Indicators of a controller on the held-out seeds, (K,) each."""
-        seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
+        run = self._run
+        seeds = range(HELD_OUT, HELD_OUT + run.evaluation_seeds)
         # All runs together say whether compiling pays.
-        compile_functions(policy, self._run.evaluation_steps * len(seeds))
-        return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)
+        n_samples = run.evaluation_steps * run.evaluation_seeds
+        compile_functions(policy, n_samples)
+        return indicators_of(self._plant, policy, seeds, run.evaluation_steps)
+
+
+def _if_known(value: float) -> float | None:
+    """The value; None where it is NaN or infinite."""
+    return value if isfinite(value) else None
 
 
 def _nothing_known() -> dict[str, Any]:
     """What `evaluate` returns where no held-out run is made."""
-    metrics: dict[str, Any] = dict.fromkeys((*METRICS, "failures", "difference"), nan)
-    unknown = ("difference_interval", "regret", "regret_interval", "gap_closed")
-    return metrics | dict.fromkeys(unknown)
+    numbers: dict[str, Any] = dict.fromkeys((*METRICS, "failures", "difference"), nan)
+    return {
+        **numbers,
+        "difference_interval": None,
+        "regret": None,
+        "regret_interval": None,
+        "gap_closed": None,
+    }

@@ -58,14 +58,17 @@ class Coordinates:
         self._start = start
         span = scenario.state_upper - scenario.state_lower
         # A state without bounds has the size of its reference.
-        span = np.where(np.isfinite(span), span, np.abs(scenario.reference_state))
-        states = width * np.where(span > 0, span, 1.0)
+        size = np.abs(scenario.reference_state)
+        span = np.where(np.isfinite(span), span, size)
+        span = np.where(span > 0, span, 1.0)
+        states = width * span
         actions = width * (scenario.action_upper - scenario.action_lower)
         self._factors = {name: np.linalg.cholesky(start[name]) for name in HESSIAN_BLOCKS}
+        blocks = start.blocks
         self._units = {
-            "B_Vf": np.ones(start.blocks.block("B_Vf").size),
+            "B_Vf": np.ones(blocks.block("B_Vf").size),
             "b_Vf": states,
-            "B_l": np.ones(start.blocks.block("B_l").size),
+            "B_l": np.ones(blocks.block("B_l").size),
             "b_l": np.concatenate([states, actions]),
             "c_f": offset_share * states,
             "x_l": states,
@@ -80,15 +83,18 @@ class Coordinates:
         first = 0
         for name, unit in self._units.items():
             # Each block takes its own coordinates off the vector.
-            delta = unit * z[first : first + unit.size]
-            first += unit.size
+            last = first + unit.size
+            delta = unit * z[first:last]
+            first = last
             if name in HESSIAN_BLOCKS:
                 symmetric = start.blocks.block(name).unpack(delta)
-                matrix = self._factors[name] @ expm(symmetric) @ self._factors[name].T
+                factor = self._factors[name]
+                matrix = factor @ expm(symmetric) @ factor.T
                 values[name] = (matrix + matrix.T) / 2
             elif name.startswith("b_"):
-                hessian = "B_" + name[2:]
-                values[name] = start[name] - 2 * start[hessian] @ delta
+                # The minimiser of the quadratic cost moves by δ.
+                hessian = start["B_" + name[2:]]
+                values[name] = start[name] - 2 * hessian @ delta
             else:
                 values[name] = start[name] + delta
         # A candidate without a feasible state would only fail.
@@ -117,15 +123,23 @@ class PolicySearch(Algorithm):
         settings = self.configuration
         start = self.controller.parameters
         self._blocks = start.blocks
-        self._coordinates = Coordinates(start, self.scenario, settings.width, settings.offset_share)
-        self._settling = min(self.scenario.controller.horizon, settings.episode - 1)
+        self._coordinates = Coordinates(
+            start,
+            self.scenario,
+            settings.width,
+            settings.offset_share,
+        )
+        # The first samples of a stretch are of the candidate before; one at least counts.
+        horizon = self.scenario.controller.horizon
+        self._settling = min(horizon, settings.episode - 1)
+        origin = np.zeros(self._coordinates.size)
         self._search = CMA(
-            mean=np.zeros(self._coordinates.size),
+            mean=origin,
             sigma=settings.spread,
             population_size=settings.population,
             seed=int(self.rng.integers(2**31)),
         )
-        self.theta: Vector = self._coordinates.theta(np.zeros(self._coordinates.size)).theta
+        self.theta: Vector = self._coordinates.theta(origin).theta
         """θ at the mean of the search distribution, (n_θ,); the controller carries a candidate."""
         self._generations: list[list[float]] = []  # costs of all complete generations
         self._evaluated: list[float] = []  # costs of the open generation's candidates so far
@@ -135,7 +149,8 @@ class PolicySearch(Algorithm):
 
     def _ask(self) -> None:
         """Draw the candidates of a generation."""
-        self._population = [self._search.ask() for _ in range(self.configuration.population)]
+        size = self.configuration.population
+        self._population = [self._search.ask() for _ in range(size)]
 
     def _try_candidate(self) -> None:
         """Set the controller's θ to that of the next candidate."""
@@ -145,7 +160,8 @@ class PolicySearch(Algorithm):
     def _tell(self, costs: list[float]) -> None:
         """Move the search distribution by the costs of a generation, and draw the next."""
         self._generations.append(costs)
-        self._search.tell(list(zip(self._population, costs, strict=True)))
+        evaluated = zip(self._population, costs, strict=True)
+        self._search.tell(list(evaluated))
         self._ask()
 
     def observe(self, transition: Transition) -> Update | None:
@@ -160,9 +176,9 @@ class PolicySearch(Algorithm):
         self._costs.append(cost)
         if len(self._costs) < self.configuration.episode:
             return None
-        # The first samples are of the candidate before.
         settled = self._costs[self._settling :]
-        self._evaluated.append(float(np.cumsum(settled)[-1]) / len(settled))
+        mean_cost = float(np.cumsum(settled)[-1]) / len(settled)
+        self._evaluated.append(mean_cost)
         self._costs = []
         mean_before = self.theta
         candidate_before = self.controller.theta
@@ -172,10 +188,13 @@ class PolicySearch(Algorithm):
             self.theta = self._coordinates.theta(self._search.mean).theta
         self._try_candidate()
         # The log's step is that of the mean, its eigenvalue that of the candidate.
-        candidate = self.controller.theta
-        update = update_without_fit(self._blocks, candidate_before, candidate)
-        step = update_without_fit(self._blocks, mean_before, self.theta).step
-        return update._replace(step=step)
+        of_candidate = update_without_fit(
+            self._blocks,
+            candidate_before,
+            self.controller.theta,
+        )
+        of_mean = update_without_fit(self._blocks, mean_before, self.theta)
+        return of_candidate._replace(step=of_mean.step)
 
     def state_dict(self) -> State:
         """All costs: with the seed they say what CMA-ES has drawn and learned."""

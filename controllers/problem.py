@@ -652,6 +652,11 @@ class PlantProblem:
         not fit the plant, or the state that it has is not the whole state, ModelError where it
         cannot be loaded.
         """
+        if scenario.signals:
+            raise OptimumError(
+                f"scenario '{scenario.name}' has signals, and the optimum is computed where nothing "
+                "moves with time: there is no J* of this scenario yet"
+            )
         filtered = _filtered(scenario)
         _require_whole_state(scenario, filtered)
         problem = Problem.from_scenario(scenario)

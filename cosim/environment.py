@@ -50,6 +50,13 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     ) -> None:
         self.render_mode = render_mode
         self._plant = FmuPlant(scenario)
+        if self.scenario.signals:
+            name = self.scenario.name
+            self._plant.close()
+            raise PlantError(
+                f"scenario '{name}' has signals, which an observation does not have yet: use "
+                "cosim.simulate"
+            )
         # The FMU's own ranges of its states.
         low, high = self._plant.state_range
         sensors = self.scenario.sensors or ()

@@ -59,6 +59,8 @@ def back_off(
             they are normal about this, new in each sample.
         samples: of the model that the search takes.
     """
+    # Nobody has trained for a signal; θ is what it moves from.
+    scenario = scenario.still
     # A study asks for the same θ in every run.
     key = (scenario.hash, start.hash, deviation, samples)
     if key in _searched:
@@ -99,6 +101,7 @@ def add_reserve(
         reserve: the back-off, in standard deviations of the one-step error.
         samples: of the simulation.
     """
+    scenario = scenario.still
     plant = GuessedPlant(scenario, deviation)
     controller = measured(scenario, nmpc(scenario, start))
     loop = ClosedLoop(plant.step, controller, scenario)

@@ -36,6 +36,11 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
             f"scenario '{scenario.name}' has sensors, and an estimator cannot be exported: export "
             "the controller of the state, from the same scenario without [[sensor]]"
         )
+    if scenario.signals:
+        raise ControllerLookupError(
+            f"scenario '{scenario.name}' has signals, which an exported controller cannot take yet: "
+            "export it from the same scenario without [[signal]]"
+        )
     controller: Any = build_controller(name, scenario)
     if type(controller) is not RtiNmpc or controller.iterations != 1:
         raise ControllerLookupError(

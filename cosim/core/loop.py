@@ -7,7 +7,7 @@ the search of a back-off on the controller's own model. Its counterpart in C is
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -45,7 +45,8 @@ class ClosedLoop:
     """A plant and a controller in closed loop.
 
     A sample is `prepare`, then `feedback(s)`, then the plant steps under the action, saturated to
-    the actuators' bounds. Where the plant has sensors the controller is given y in place of s. A
+    the actuators' bounds. Where the plant has sensors the controller is given y in place of s.
+    Where the scenario has signals it is told before `prepare` what is known of them then. A
     failed solve is an exception whose class has `is_solver_failure`: the last applied action (first
     the reference action) is then applied once more, and the controller is reset. Every other error
     is raised.
@@ -55,6 +56,8 @@ class ClosedLoop:
         controller: the feedback law.
         limits: bounds of the actuators, and the action of the first fallback.
         keeps_points: whether `point` is read from the controller.
+        known: what is known of the scenario's signals at a sample, by its number
+            (`cosim.core.signals`); None without signals.
 
     Attributes:
         lower, upper: bounds of the actuators, (m,).
@@ -73,6 +76,7 @@ class ClosedLoop:
         limits: ActionLimits,
         *,
         keeps_points: bool = False,
+        known: Callable[[int], Mapping[str, Array]] | None = None,
     ) -> None:
         self._step = step
         self._controller = controller
@@ -84,6 +88,8 @@ class ClosedLoop:
         self._report_action = getattr(controller, "applied", None)
         self._resume = getattr(controller, "resume", controller.reset)
         self._given = getattr(controller, "given", "state")
+        self._inform = getattr(controller, "inform", None)
+        self._known = known
         self.s: Array = np.empty(0)
         self.y: Array | None = None
         self.number = 0
@@ -144,6 +150,8 @@ class ClosedLoop:
         # The two phases are timed apart: only feedback delays the action.
         try:
             if prepare:
+                if self._known is not None and self._inform is not None:
+                    self._inform(self._known(self.number))
                 self._controller.prepare()
                 # Now: a feedback of several QPs linearises elsewhere.
                 if self._keeps_points:

@@ -125,6 +125,11 @@ class Controller(Protocol):
     - `resume()`: is called in place of `reset` after a failed solve, to keep the estimate;
     - `estimate`: of the state, (n,), for records.
 
+    And for a scenario with signals:
+
+    - `inform(known)`: is called before `prepare` with what is known of the signals at the sample,
+      by their names: the present value and, of a preview, the coming ones, (1 + ahead,).
+
     An exception whose class has `is_solver_failure = True` makes the loop apply its fallback.
     """
 

@@ -23,7 +23,8 @@ from cosim.core.errors import ScenarioError
 from cosim.core.files import read_toml
 from cosim.core.modules import import_from
 from cosim.core.result import Shown
-from cosim.core.validation import SchemaVersion, suggestion, validated
+from cosim.core.signal_file import read_signal_file
+from cosim.core.validation import SchemaVersion, instead, suggestion, validated
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -211,6 +212,102 @@ class EstimatorTable(Table):
     controller's model, as a share of its nominal value; 0 takes the parameters as they are."""
 
 
+class SignalTable(Table):
+    """A signal: what moves with time, what it moves, and what a controller knows of it.
+
+    Each value holds until the next one; the last one until the end of `period` or `once`.
+    """
+
+    name: Name
+    """Its name in messages and records, and to controllers."""
+    values: Annotated[Numbers, Field(min_length=1)]
+    """Its values. A `file` takes their place, a CSV with a column of the signal's name and, if the
+    values are not evenly spread, a column `time`."""
+    times: NonNegatives | None = None
+    """Times in s at which the values begin, from 0 on; without it they are evenly spread."""
+    period: Positive | None = None
+    """Seconds after which the values begin again."""
+    once: Positive | None = None
+    """Seconds that the values last; a longer run is refused."""
+    plant: Name | None = None
+    """The FMU's input or tunable parameter that it drives, from the begin of each sample."""
+    price_of: Name | None = None
+    """The FMU's output that it is the price of, in the cost of a sample."""
+    included: Number = 0.0
+    """The price of that output which the FMU's own stage cost has in it."""
+    model: Name | None = None
+    """The disturbance or parameter that it is in the controller's model."""
+    bound: Annotated[str, Field(pattern=r"^x_[lu]\[.+\]$")] | None = None
+    """The state bound that it is, `x_l[X2]` or `x_u[X2]`, to the penalty too."""
+    reference: Name | None = None
+    """The state or action whose reference it is."""
+    known: Literal["none", "now", "preview"] = "none"
+    """What a controller knows: nothing, the present value, or the coming ones too."""
+    ahead: Annotated[int, Field(ge=1, le=1000)] | None = None
+    """Samples that a preview reaches beyond the present one; without it the horizon."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_file(cls, document: Any) -> Any:
+        """The document with what its `file` holds in the place of it, so that the hash has it."""
+        if not isinstance(document, Mapping) or "file" not in document:
+            return document
+        content = dict(document)
+        file = content.pop("file")
+        if "values" in content or "times" in content:
+            raise ValueError("signal: give either file, or values and times")
+        return content | read_signal_file(str(file), str(content.get("name", "")))
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        where = f"signal '{self.name}'"
+        if (self.period is None) == (self.once is None):
+            raise ValueError(
+                f"{where}: give period, the seconds after which its values begin again, or once, "
+                "the seconds that they last"
+            )
+        if self.times is not None:
+            if len(self.times) != len(self.values) or self.times[0] != 0:
+                raise ValueError(f"{where}: times must be one for each value, the first 0")
+            for time, next_time in pairwise((*self.times, self.length)):
+                if time >= next_time:
+                    raise ValueError(
+                        f"{where}: times must increase and end before its {self.length:g} s"
+                    )
+        roles = [self.model, self.bound, self.reference]
+        if sum(role is not None for role in roles) > 1:
+            raise ValueError(f"{where}: it can be one of model, bound and reference")
+        if not any((self.plant, self.price_of, *roles)):
+            raise ValueError(
+                f"{where}: it moves nothing; give plant, price_of, model, bound or reference"
+            )
+        if self.known != "none" and not any(roles):
+            raise ValueError(
+                f"{where}: known = '{self.known}' needs model, bound or reference: what it is to "
+                "the controller"
+            )
+        if self.ahead is not None and self.known != "preview":
+            raise ValueError(f"{where}: ahead needs known = 'preview'")
+        return self
+
+    @property
+    def length(self) -> float:
+        """Seconds from its first value to its end, or to its begin anew."""
+        length = self.period or self.once
+        assert length is not None
+        return length
+
+    @property
+    def bounded_state(self) -> str:
+        """Name of the state whose bound it is; empty where it is none."""
+        return "" if self.bound is None else self.bound[4:-1]
+
+    @property
+    def is_lower_bound(self) -> bool:
+        """Whether it is a lower bound."""
+        return self.bound is not None and self.bound.startswith("x_l")
+
+
 class ControllerTable(Table):
     """The controller's model, solver and operating point."""
 
@@ -345,6 +442,10 @@ class Scenario(Shown, Table):
     """Tables `[[sensor]]`: what is measured; without any each state, exactly, at each sample."""
     estimator: EstimatorTable | None = None
     """Table `[estimator]`, where there are sensors."""
+    signals: Annotated[
+        tuple[SignalTable, ...] | None, Field(alias="signal", min_length=1, strict=False)
+    ] = None
+    """Tables `[[signal]]`: what moves with time."""
 
     @model_validator(mode="after")
     def _sizes_and_signs_fit(self) -> Self:
@@ -352,6 +453,7 @@ class Scenario(Shown, Table):
         self._check_bounds()
         self._check_times()
         self._check_sensors()
+        self._check_signals()
         plant = self.plant
         law = self.disturbance.law
         names = (*plant.states, *plant.actions, *plant.disturbances)
@@ -448,6 +550,61 @@ class Scenario(Shown, Table):
                 f"estimator.sensor_deviation: must have one entry per sensor ({len(sensors)}), "
                 f"not {len(expected)}"
             )
+
+    def _check_signals(self) -> None:
+        """Raise ValueError where signals do not fit each other or the states and actions."""
+        signals = self.signals or ()
+        for field in ("name", "plant", "model", "bound", "reference"):
+            targets = [getattr(signal, field) for signal in signals]
+            for target in targets:
+                if target is not None and targets.count(target) > 1:
+                    raise ValueError(f"signal: two of them have the {field} '{target}'")
+        plant = self.plant
+        changed: set[str] = set()
+        for change in plant.changes or ():
+            changed |= change.parameters.keys()
+        for signal in signals:
+            where = f"signal '{signal.name}'"
+            if signal.plant in plant.actions:
+                raise ValueError(f"{where}: plant '{signal.plant}' is an action")
+            if signal.plant in changed:
+                raise ValueError(f"{where}: plant '{signal.plant}' is set by plant.changes too")
+            state = signal.bounded_state
+            if state and state not in plant.states:
+                raise ValueError(
+                    f"{where}: bound '{signal.bound}' is of no state{instead(state, plant.states)}"
+                )
+            names = (*plant.states, *plant.actions)
+            if signal.reference is not None and signal.reference not in names:
+                raise ValueError(
+                    f"{where}: reference '{signal.reference}' is no state or action"
+                    f"{instead(signal.reference, names)}"
+                )
+        self._check_moving_bounds()
+        is_filtered = self.sensors and (self.estimator or EstimatorTable()).kind == "ekf"
+        for signal in signals:
+            if is_filtered and signal.model is not None and signal.known != "none":
+                raise ValueError(
+                    f"signal '{signal.name}': the estimator 'ekf' does not know of a signal of the "
+                    "model; name another estimator.kind"
+                )
+
+    def _check_moving_bounds(self) -> None:
+        """Raise ValueError where a moving bound may come to its counterpart."""
+        highest = dict(zip(self.plant.states, self.bounds.state_lower, strict=True))
+        lowest = dict(zip(self.plant.states, self.bounds.state_upper, strict=True))
+        for signal in self.signals or ():
+            if signal.is_lower_bound:
+                highest[signal.bounded_state] = max(signal.values)
+            elif signal.bound is not None:
+                lowest[signal.bounded_state] = min(signal.values)
+        for name in self.plant.states:
+            # Where nothing moves this has been checked.
+            if not highest[name] < lowest[name]:
+                raise ValueError(
+                    f"signal: the lower bound of '{name}' comes up to {highest[name]:g}, and its "
+                    f"upper bound down to {lowest[name]:g}"
+                )
 
     def _facts(self) -> dict[str, object]:
         plant = self.plant
@@ -572,6 +729,20 @@ class Scenario(Shown, Table):
         if not self.sensors:
             return ()
         return tuple(f"estimated[{name}]" for name in self.plant.states)
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Names of the signals in records, `signal[price]` say; none without signals."""
+        return tuple(f"signal[{signal.name}]" for signal in self.signals or ())
+
+    @cached_property
+    def still(self) -> Scenario:
+        """The scenario without its signals; itself where it has none."""
+        if self.signals is None:
+            return self
+        document = self.to_dict()
+        del document["signal"]
+        return Scenario.from_dict(document)
 
     @cached_property
     def limits(self) -> dict[str, tuple[float, float]]:
@@ -774,6 +945,10 @@ def resolved(
         fmu = plant.get("fmu")
         if isinstance(fmu, str) and is_file(fmu):
             plant["fmu"] = str(folder / fmu)
+    signals = result.get("signal")
+    for signal in signals if isinstance(signals, list) else ():
+        if isinstance(signal, dict) and isinstance(signal.get("file"), str):
+            signal["file"] = str(folder / signal["file"])
     base = result.pop("extends", None)
     if base is None:
         return result

@@ -13,6 +13,7 @@ import numpy as np
 from cosim.core.errors import CosimError, PlantError, RunEndedError
 from cosim.core.loop import ClosedLoop, Sample, controller_name
 from cosim.core.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
+from cosim.core.signals import signals_of
 from cosim.core.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
 from cosim.core.validation import whole_number
 
@@ -80,8 +81,12 @@ def simulate(
 
     Raises:
         RunEndedError: the plant failed in mid run; its `trajectory` has the samples before.
+        ScenarioError: a signal of the scenario, or its preview, ends before the run.
     """
     steps = whole_number("steps", steps, 1, CosimError)
+    signals = signals_of(plant.scenario)
+    if signals is not None:
+        signals.require(steps)
     _compile(controller, steps)
     # The columns are there before the recorder opens its file: they may not fit the memory.
     run = _Run(plant, controller, steps, seed, residuals)
@@ -149,7 +154,9 @@ class _Run:
         scenario = plant.scenario
         self._plant = plant
         self._controller = controller
-        self._loop = ClosedLoop(plant.step, controller, scenario)
+        signals = signals_of(scenario)
+        known = None if signals is None else signals.known
+        self._loop = ClosedLoop(plant.step, controller, scenario, known=known)
         self._scenario = scenario
         self._seed = seed
         self._steps = steps

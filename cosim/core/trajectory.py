@@ -17,6 +17,7 @@ from cosim.core.files import replacing
 from cosim.core.protocols import Array
 from cosim.core.result import Result, csv_text
 from cosim.core.scenario import VIOLATING, Scenario
+from cosim.core.signals import sample_numbers, signals_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,12 +71,29 @@ class SignalKind:
 
 
 def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
-    return scenario.state_penalty.along(columns["states"])
+    signals = signals_of(scenario)
+    if signals is None or not signals.move_bounds:
+        return scenario.state_penalty.along(columns["states"])
+    samples = sample_numbers(columns["time"], scenario)
+    return signals.penalties_along(columns["states"], samples)
 
 
 def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
-    total: Array = scenario.state_penalty.violation(columns["states"]).sum(axis=1)
+    signals = signals_of(scenario)
+    if signals is None or not signals.move_bounds:
+        violations = scenario.state_penalty.violation(columns["states"])
+    else:
+        samples = sample_numbers(columns["time"], scenario)
+        violations = signals.violations_along(columns["states"], samples)
+    total: Array = violations.sum(axis=1)
     return total
+
+
+def _signals(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
+    signals = signals_of(scenario)
+    if signals is None:
+        return np.empty((len(columns["time"]), 0))
+    return signals.along(sample_numbers(columns["time"], scenario))
 
 
 # Loop, CSV, recording and comparison follow this table: a derived signal is declared here alone.
@@ -86,6 +104,7 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("disturbances", group="disturbances", vector="plant.disturbances"),
     SignalKind("measurements", group="sensors", vector="measurement_names"),
     SignalKind("estimates", group="sensors", vector="estimate_names"),
+    SignalKind("signals", _signals, group="unseen", vector="signal_names"),
     SignalKind("stage_cost", unit=COST, group="costs"),
     SignalKind("penalty", _penalty, COST, "costs"),
     SignalKind("violation", _violation),

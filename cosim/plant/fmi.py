@@ -839,6 +839,20 @@ class Instance(ABC):
         buffer[:] = values
         return write
 
+    def channel(self, places: Sequence[Place]) -> Callable[[Sequence[float]], None]:
+        """A function that writes values of places, one for each, between two steps.
+
+        Args:
+            places: where.
+        """
+        buffer, write = self._exchange(places, "Set")
+
+        def send(values: Sequence[float]) -> None:
+            buffer[:] = values
+            write()
+
+        return send
+
     def _all_real(self, places: Iterable[Place]) -> bool:
         """Whether they are FMI's reals, none in an array: compiled code can exchange those."""
         return all(place.type == self.real and len(place.starts) == 1 for place in places)

@@ -17,7 +17,8 @@ from cosim.core.errors import CapabilityError, PlantError
 from cosim.core.protocols import Array, CompiledLoop, Step
 from cosim.core.scenario import Scenario
 from cosim.core.sensors import Sensors
-from cosim.plant.fmi import NOT_FINITE_STATUS, Instance, Intermediate, unpack
+from cosim.core.signals import signals_of
+from cosim.plant.fmi import NOT_FINITE_STATUS, Instance, Intermediate, UnpackedFmu, unpack
 from cosim.plant.probe import Restart, as_asked, probe_of, subject_of
 from cosim.plant.wiring import Wiring, refusals, seed_words
 
@@ -45,11 +46,11 @@ class Snapshot:
 class FmuPlant:
     """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
 
-    At sample k, time k·h, the action is written, and ℓ(x_k, u_k, d_k) and d_k are read, before or
-    after the step as the FMU needs it (`cosim.plant.probe`). The FMU steps by the sampling time h,
-    at once or by `plant.communication_step`, and x_{k+1} is read. The FMU's own time is
-    `plant.start_time` + k·h. Use it as a context manager, or call `close`. An FMU is native code:
-    name only files that you trust.
+    At sample k, time k·h, signals and the action are written, and ℓ(x_k, u_k, d_k) and d_k are
+    read, before or after the step as the FMU needs it (`cosim.plant.probe`). The FMU steps by the
+    sampling time h, at once or by `plant.communication_step`, and x_{k+1} is read. The FMU's own
+    time is `plant.start_time` + k·h. Use it as a context manager, or call `close`. An FMU is native
+    code: name only files that you trust.
 
     Args:
         scenario: a `Scenario` or what `Scenario.load` takes.
@@ -92,15 +93,10 @@ class FmuPlant:
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
         plant = self.scenario.plant
-        names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
-        sensors = self.scenario.sensors or ()
-        variables = [sensor.variable for sensor in sensors]
-        self.units = {name: archive.unit(name) for name in (*names, *variables)}
-        for sensor, name in zip(sensors, self.scenario.measurement_names, strict=True):
-            self.units[name] = self.units[sensor.variable]
-        for name, estimate in zip(plant.states, self.scenario.estimate_names, strict=False):
-            self.units[estimate] = self.units[name]
+        self.units = _units(self.scenario, archive)
+        sensors = self.scenario.sensors
         self._sensors = Sensors(sensors) if sensors else None
+        self._signals = signals_of(self.scenario)
         self.y: Array | None = None
         ranges = np.array([archive.range(name) for name in plant.states])
         self.state_range = ranges[:, 0], ranges[:, 1]
@@ -160,14 +156,17 @@ class FmuPlant:
             self._intermediate and self._since_reset,
         )
         in_one_step = self._steps == 1 and self._intermediate is None
-        self.drivable = fmi.drivable and in_one_step and self._sensors is None
+        bare = self._sensors is None and self._signals is None
+        self.drivable = fmi.drivable and in_one_step and bare
+        self._drive_signals = fmi.channel(wiring.signals)
         self._changes = {k: fmi.writer(*change) for k, change in wiring.changes().items()}
         self._advance = fmi.advance if self._steps == 1 else self._advance_in_steps
         self._inputs = fmi.inputs
         self._outputs = fmi.outputs
         self._exchanged = fmi.states
         self._copy_states = fmi.states_view[: self._n].copy
-        self._copy_disturbances = fmi.outputs_view[1:].copy
+        n_disturbances = len(self.scenario.plant.disturbances)
+        self._copy_disturbances = fmi.outputs_view[1 : 1 + n_disturbances].copy
 
     @property
     def _states(self) -> list[float]:
@@ -271,6 +270,11 @@ class FmuPlant:
         self._inputs[:] = values
         penalty = self._penalty_now
         k = self._k
+        prices: list[float] = []
+        if self._signals is not None:
+            # Before anything changes: a signal may have ended.
+            penalty = self._signals.penalty(k)(self._states)
+            prices = self._write_signals(k)
         # Until the step is done: after an error the plant needs a reset.
         self._k = _NOT_STARTED
         if self._changes and k in self._changes:
@@ -278,6 +282,8 @@ class FmuPlant:
         self._advance(self._start_time + k * self._h)
         exchanged = self._exchanged[:]
         cost = self._outputs[0]
+        if prices:
+            cost += self._charge(prices)
         if not isfinite(cost + sum(exchanged)):
             self._refuse_output(k)
         self._k = k + 1
@@ -285,6 +291,26 @@ class FmuPlant:
         if self._sensors is not None:
             self.y = self._sensors.read(k + 1, exchanged[self._n :])
         return Step(self._copy_states(), cost, penalty, self._copy_disturbances(), self.y)
+
+    def _write_signals(self, k: int) -> list[float]:
+        """Drive the FMU by the signals of sample k; prices beyond those that its cost includes."""
+        assert self._signals is not None
+        driving = []
+        prices = []
+        for table, value in zip(self._signals.tables, self._signals.at(k).tolist(), strict=True):
+            if table.plant is not None:
+                driving.append(value)
+            if table.price_of is not None:
+                prices.append(value - table.included)
+        if driving:
+            self._drive_signals(driving)
+        return prices
+
+    def _charge(self, prices: Sequence[float]) -> float:
+        """Cost of what signals are the prices of, as it was read in the last step."""
+        first = 1 + len(self.scenario.plant.disturbances)
+        quantities: list[float] = self._outputs[first:]
+        return sum(price * quantity for price, quantity in zip(prices, quantities, strict=True))
 
     def _advance_in_steps(self, time: float) -> None:
         """Step through a sample; the outputs are those of its first step."""
@@ -482,3 +508,21 @@ class FmuPlant:
         values |= dict(zip((*table.states, *variables), self._exchanged, strict=True))
         bad = ", ".join(f"{name} = {x}" for name, x in values.items() if not isfinite(x))
         raise PlantError(f"FMU '{self.fmu_path.name}' returned {bad} at step {k}")
+
+
+def _units(scenario: Scenario, archive: UnpackedFmu) -> dict[str, str]:
+    """Units of a scenario's variables, readings, estimates and signals, by name."""
+    plant = scenario.plant
+    names = [*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost]
+    sensors = scenario.sensors or ()
+    names += [sensor.variable for sensor in sensors]
+    units = {name: archive.unit(name) for name in names}
+    for sensor, name in zip(sensors, scenario.measurement_names, strict=True):
+        units[name] = units[sensor.variable]
+    for name, estimate in zip(plant.states, scenario.estimate_names, strict=False):
+        units[estimate] = units[name]
+    for signal, name in zip(scenario.signals or (), scenario.signal_names, strict=True):
+        # That of what it drives, or is; a price has none.
+        target = signal.plant or signal.bounded_state or signal.reference
+        units[name] = archive.unit(target) if target else ""
+    return units

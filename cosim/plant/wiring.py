@@ -128,8 +128,10 @@ class Wiring:
 
     Attributes:
         inputs, states: places of the actions and states.
-        outputs: places of the stage cost, which is the first, and the disturbances.
+        outputs: places of the stage cost, which is the first, the disturbances, and what signals
+            are the prices of.
         sensors: places of the variables that sensors read.
+        signals: places of the variables that signals drive.
         seeds: places of the seed's words, low word first.
         initial: places of the parameters for the initial state.
         starts: places and values of all start values.
@@ -146,6 +148,9 @@ class Wiring:
         self.interface = interface(fmu)
         self.experiment = experiment(fmu, plant)
         self.outputs = self._number_places((plant.stage_cost, *plant.disturbances), "plant")
+        signals = scenario.signals or ()
+        priced = [signal.price_of for signal in signals if signal.price_of is not None]
+        self.outputs += self._number_places(priced, "signal")
         self.states = self._number_places(plant.states, "plant.states")
         variables = [sensor.variable for sensor in scenario.sensors or ()]
         self.sensors = self._number_places(variables, "sensor")
@@ -160,6 +165,9 @@ class Wiring:
         self._require_whole_arrays([place for place, _ in self.starts])
         self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
         self._require_whole_arrays(self.inputs)
+        driven = [signal.plant for signal in signals if signal.plant is not None]
+        self.signals = [self._place(name, "signal", _not_written) for name in driven]
+        self._require_whole_arrays(self.signals)
 
     def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
         """Places to write at the start of a sample, and the values, by the sample's number."""

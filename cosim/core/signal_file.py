@@ -1,0 +1,66 @@
+"""A signal's values from a CSV file."""
+
+from __future__ import annotations
+
+import csv
+from math import isfinite
+
+TIME = "time"
+"""Column of the times in s, where a file has one."""
+
+
+def read_signal_file(path: str, name: str) -> dict[str, list[float]]:
+    """Read a signal's values, and their times if the file has them.
+
+    A title may end with a unit in brackets, `time [s]` say.
+
+    Args:
+        path: of a CSV file whose first line has the titles.
+        name: of the signal, the title of its column.
+
+    Returns:
+        `values`, and `times` where there is a column `time`.
+
+    Raises:
+        ValueError: the file cannot be read, lacks the column, or has a cell that is no finite
+            number; with file and line.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if row]
+    except (OSError, UnicodeDecodeError, ValueError, csv.Error) as cause:
+        raise ValueError(f"signal '{name}': file '{path}' cannot be read: {cause}") from None
+    titles = []
+    if rows:
+        titles = [title.partition("[")[0].strip() for title in rows[0]]
+    if name not in titles:
+        known = ", ".join(titles) or "nothing"
+        raise ValueError(f"signal '{name}': file '{path}' has no column '{name}'; it has {known}")
+    content = {"values": _column(rows, titles, name, path)}
+    if TIME in titles and name != TIME:
+        content["times"] = _column(rows, titles, TIME, path)
+    return content
+
+
+def _column(
+    rows: list[list[str]],
+    titles: list[str],
+    title: str,
+    path: str,
+) -> list[float]:
+    """Numbers of a column; raises ValueError where a cell is none, with its line."""
+    place = titles.index(title)
+    numbers = []
+    # The titles are line 1.
+    for line, row in enumerate(rows[1:], start=2):
+        cell = row[place].strip() if place < len(row) else ""
+        try:
+            number = float(cell)
+        except ValueError:
+            number = float("nan")
+        if not isfinite(number):
+            raise ValueError(
+                f"signal: '{path}', line {line}: {title} is no finite number but '{cell}'"
+            )
+        numbers.append(number)
+    return numbers

@@ -1,0 +1,183 @@
+"""Signals: what moves with time in a scenario, at each sample, and what is known of it then."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from math import floor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import ScenarioError
+from cosim.core.protocols import Array
+from cosim.core.scenario import Penalty, Scenario, SignalTable
+
+Known = Mapping[str, Array]
+"""Values of each signal that is known, by its name: the present one, and those of a preview."""
+ROUNDING = 1e-6
+"""Share of a sample by which a value may begin late: k·h and its time are rounded."""
+
+
+class Signals:
+    """The values of a scenario's signals at its samples.
+
+    Args:
+        scenario: with signals.
+
+    Attributes:
+        tables: the signals.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.tables = tuple(scenario.signals or ())
+        self._scenario = scenario
+        self._h = scenario.sampling_time
+        self._times = [_times(table) for table in self.tables]
+        self._bounds = [i for i, table in enumerate(self.tables) if table.bound is not None]
+        self._penalties: dict[tuple[float, ...], Penalty] = {}
+
+    @property
+    def move_bounds(self) -> bool:
+        """Whether one of them is a bound."""
+        return bool(self._bounds)
+
+    def require(self, samples: int) -> None:
+        """Check that the signals last for a run, and their previews.
+
+        Args:
+            samples: of the run.
+
+        Raises:
+            ScenarioError: one of them ends too early.
+        """
+        for i, table in enumerate(self.tables):
+            ahead = self.ahead(i)
+            if table.once is None or self._lasts_to(i, samples - 1 + ahead):
+                continue
+            needed = (samples + ahead) * self._h
+            purpose = f"a run of {samples} samples"
+            if ahead:
+                purpose += f" with a preview of {ahead}"
+            raise ScenarioError(
+                f"scenario '{self._scenario.name}': signal '{table.name}' ends after "
+                f"{table.once:g} s, and {purpose} needs {needed:g} s of it"
+            )
+
+    def _lasts_to(self, i: int, k: int) -> bool:
+        """Whether signal i has a value at sample k."""
+        once = self.tables[i].once
+        return once is None or k * self._h < once - ROUNDING * self._h
+
+    def ahead(self, i: int) -> int:
+        """Samples beyond the present one of which signal i is known."""
+        table = self.tables[i]
+        if table.known != "preview":
+            return 0
+        return table.ahead or self._scenario.controller.horizon
+
+    def value(self, i: int, k: int) -> float:
+        """Value of signal i at sample k; raises ScenarioError beyond its end."""
+        table = self.tables[i]
+        if not self._lasts_to(i, k):
+            raise ScenarioError(
+                f"scenario '{self._scenario.name}': signal '{table.name}' has ended before sample "
+                f"{k}: it lasts {table.once:g} s"
+            )
+        time = k * self._h
+        if table.period is not None:
+            # k·h may be just below a multiple of the period.
+            periods = floor(time / table.period + ROUNDING * self._h / table.period)
+            time -= periods * table.period
+        # The last value that has begun by then.
+        begun = bisect_right(self._times[i], time + ROUNDING * self._h)
+        return self.tables[i].values[max(begun - 1, 0)]
+
+    def at(self, k: int) -> Array:
+        """Values of all signals at sample k, (n_signals,)."""
+        return np.array([self.value(i, k) for i in range(len(self.tables))])
+
+    def along(self, samples: NDArray[np.intp]) -> Array:
+        """Values of all signals at K samples, (K, n_signals)."""
+        table = np.empty((len(samples), len(self.tables)))
+        for row, k in enumerate(samples.tolist()):
+            table[row] = self.at(k)
+        return table
+
+    def known(self, k: int) -> Known:
+        """What a controller knows at sample k, by the signals' names.
+
+        Args:
+            k: number of the sample.
+
+        Returns:
+            The values at the samples k, k+1, … as far as they are known.
+        """
+        known = {}
+        for i, table in enumerate(self.tables):
+            if table.known == "none":
+                continue
+            coming = range(k, k + self.ahead(i) + 1)
+            known[table.name] = np.array([self.value(i, j) for j in coming])
+        return known
+
+    def penalty(self, k: int) -> Penalty:
+        """Penalty of a state by the bounds at sample k."""
+        if not self._bounds:
+            return self._scenario.state_penalty
+        values = tuple(self.value(i, k) for i in self._bounds)
+        if values not in self._penalties:
+            self._penalties[values] = self._penalty(values)
+        return self._penalties[values]
+
+    def _penalty(self, values: tuple[float, ...]) -> Penalty:
+        """Penalty where the moving bounds have these values."""
+        scenario = self._scenario
+        lower = scenario.state_lower.copy()
+        upper = scenario.state_upper.copy()
+        for i, value in zip(self._bounds, values, strict=True):
+            table = self.tables[i]
+            bounds = lower if table.is_lower_bound else upper
+            bounds[scenario.plant.states.index(table.bounded_state)] = value
+        return Penalty(lower, upper, scenario.penalty_linear, scenario.penalty_quadratic)
+
+    def penalties_along(self, states: Array, samples: NDArray[np.intp]) -> Array:
+        """Penalties (K,) of states (K, n) at the bounds of their samples (K,)."""
+        total = np.empty(len(states))
+        for penalty, rows in self._by_penalty(samples):
+            total[rows] = penalty.along(states[rows])
+        return total
+
+    def violations_along(self, states: Array, samples: NDArray[np.intp]) -> Array:
+        """Violations (K, n) of states (K, n) at the bounds of their samples (K,)."""
+        violations = np.empty(states.shape)
+        for penalty, rows in self._by_penalty(samples):
+            violations[rows] = penalty.violation(states[rows])
+        return violations
+
+    def _by_penalty(self, samples: NDArray[np.intp]) -> list[tuple[Penalty, NDArray[np.intp]]]:
+        """The penalties of samples, each with the rows of its samples."""
+        penalties = [self.penalty(k) for k in samples.tolist()]
+        groups = []
+        for penalty in dict.fromkeys(penalties):
+            rows = [row for row, other in enumerate(penalties) if other is penalty]
+            groups.append((penalty, np.array(rows, dtype=np.intp)))
+        return groups
+
+
+def _times(table: SignalTable) -> list[float]:
+    """Times in s at which a signal's values begin, increasing from 0."""
+    if table.times is not None:
+        return list(table.times)
+    count = len(table.values)
+    return [i * table.length / count for i in range(count)]
+
+
+def signals_of(scenario: Scenario) -> Signals | None:
+    """The signals of a scenario; None without any."""
+    return Signals(scenario) if scenario.signals else None
+
+
+def sample_numbers(times: Array, scenario: Scenario) -> NDArray[np.intp]:
+    """Numbers of the samples at some times in s, (K,)."""
+    return np.rint(times / scenario.sampling_time).astype(np.intp)

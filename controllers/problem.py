@@ -654,8 +654,8 @@ class PlantProblem:
         """
         if scenario.signals:
             raise OptimumError(
-                f"scenario '{scenario.name}' has signals, and the optimum is computed where nothing "
-                "moves with time: there is no J* of this scenario yet"
+                f"scenario '{scenario.name}' has signals, and the optimum is computed where "
+                "nothing moves with time: there is no J* of this scenario yet"
             )
         filtered = _filtered(scenario)
         _require_whole_state(scenario, filtered)

@@ -260,8 +260,8 @@ def begin_training(
     """
     if run.scenario.signals:
         raise ConfigurationError(
-            f"scenario '{run.scenario.name}' has signals, which no rule can learn with yet: train on "
-            "the same scenario without [[signal]], and simulate or evaluate the θ on this one"
+            f"scenario '{run.scenario.name}' has signals, which no rule can learn with yet: train "
+            "on the same scenario without [[signal]], and simulate or evaluate the θ on this one"
         )
     if run.scenario.sensors and not getattr(algorithm, "learns_from_estimates", False):
         raise ConfigurationError(

@@ -38,8 +38,8 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
         )
     if scenario.signals:
         raise ControllerLookupError(
-            f"scenario '{scenario.name}' has signals, which an exported controller cannot take yet: "
-            "export it from the same scenario without [[signal]]"
+            f"scenario '{scenario.name}' has signals, which an exported controller cannot take "
+            "yet: export it from the same scenario without [[signal]]"
         )
     controller: Any = build_controller(name, scenario)
     if type(controller) is not RtiNmpc or controller.iterations != 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from math import isfinite
+from pathlib import Path
 
 TIME = "time"
 """Column of the times in s, where a file has one."""
@@ -26,7 +27,7 @@ def read_signal_file(path: str, name: str) -> dict[str, list[float]]:
             number; with file and line.
     """
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
+        with Path(path).open(newline="", encoding="utf-8-sig") as stream:
             rows = [row for row in csv.reader(stream) if row]
     except (OSError, UnicodeDecodeError, ValueError, csv.Error) as cause:
         raise ValueError(f"signal '{name}': file '{path}' cannot be read: {cause}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import casadi as ca
@@ -98,6 +99,32 @@ def _economic_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     F3 = by_name(PARAMETER_VALUES, p)["F3"]
     flows = _flows(x, u, w, p)
     return 10.09 * (flows.F2 + F3) + 600 * flows.F100 + 0.6 * F200
+
+
+STEAM_PRICE = Quantity("steam_price", "min/kg", 600.0)
+"""Cost of a kg of steam."""
+
+
+def _priced_ode(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
+    """`_ode`, which the last parameter, the price, has no part in."""
+    return _ode(x, u, w, p[:-1])
+
+
+def _priced_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
+    """`_economic_cost` where the last parameter is the price of steam."""
+    physical = p[:-1]
+    steam = _flows(x, u, w, physical).F100
+    return _economic_cost(x, u, w, physical) + (p[-1] - STEAM_PRICE.nominal) * steam
+
+
+def priced_model() -> Model:
+    """`model` with a parameter more, the price of steam in its economic cost."""
+    return replace(
+        model(),
+        parameters=(*PARAMETER_VALUES, STEAM_PRICE),
+        ode=_priced_ode,
+        economic_cost=_priced_cost,
+    )
 
 
 def model() -> Model:

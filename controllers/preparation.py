@@ -18,7 +18,17 @@ from controllers.model import runge_kutta
 from controllers.problem import Problem
 from controllers.qp import LEAST_SIZE, SoftQp
 from controllers.reuse import built_once
-from controllers.theta import Parameters, Symbols, ThetaBlocks, symbolic_theta
+from controllers.stage_symbols import (
+    given_size,
+    moved_references,
+    stage_columns,
+    state_bounds,
+    symbolic_given,
+    symbolic_stage,
+    true_bounds,
+)
+from controllers.theta import Parameters, Symbols, ThetaBlocks
+from controllers.varying import of_kind
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.validation import instead
 
@@ -45,6 +55,7 @@ def sampled_jacobian(
     x: ca.SX,
     u: ca.SX,
     parameters: ca.SX,
+    disturbance: ca.SX | None = None,
 ) -> tuple[ca.SX, ca.SX]:
     """State after one sample of the nominal model, and its Jacobian with respect to (x, u).
 
@@ -56,6 +67,7 @@ def sampled_jacobian(
         x: State at the sample's start in the model's units, (n,).
         u: Action held over the sample, (m,).
         parameters: Physical parameters of the model, (n_p,).
+        disturbance: Disturbance in the place of the nominal one, (n_d,).
 
     Returns:
         The state after the sample (n,), and its Jacobian (n, n+m).
@@ -65,10 +77,11 @@ def sampled_jacobian(
     model = problem.model
 
     # One function of the rate and its derivatives, called at each of the four points of a step.
-    free = ca.symvar(parameters)
+    if disturbance is None:
+        disturbance = ca.SX(ca.DM(model.nominal_disturbance))
+    free = ca.symvar(ca.vertcat(parameters, disturbance))
     state = ca.SX.sym("at", n)
     action = ca.SX.sym("held", m)
-    disturbance = ca.SX(ca.DM(model.nominal_disturbance))
     rate = model.ode(state, action, disturbance, parameters)
     rate_by_state = ca.jacobian(rate, state)
     rate_by_action = ca.jacobian(rate, action)
@@ -117,7 +130,7 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     u_s = ca.DM(problem.reference_action)
 
     # x₊ = f + A (x − x_k) + B (u − u_k) + c_f, in deviations from the reference.
-    x_next, jacobian = sampled_jacobian(problem, x, u, symbols["model_parameters"])
+    x_next, jacobian = _next_state(problem, symbols, x, u)
     A = jacobian[:, :n]
     B = jacobian[:, n:]
     from_state = A @ (x - x_s)
@@ -178,10 +191,13 @@ def stage_parameter_gradient(
     }
 
     # χᵀ(f + J Δw), whose J Δw is one tangent through the model.
-    x_next, _ = sampled_jacobian(problem, x, u, symbols["model_parameters"])
+    x_next, _ = _next_state(problem, symbols, x, u)
     point = ca.vertcat(x, u)
     tangent = ca.jtimes(x_next, point, w - point)
     lagrangian = ca.dot(chi, x_next + tangent)
+    if has_prices(problem):
+        change = _priced_cost(problem, symbols, x, u)
+        lagrangian += change + ca.jtimes(change, point, w - point)
     if exact:
         M = ca.SX.sym("M", n + m, n + m)
         guess = ca.SX.sym("guess", n)
@@ -224,7 +240,39 @@ def _linearisation_symbols(
     """Symbols of a stage's state (n,) and action (m,), and those of θ."""
     x = ca.SX.sym("x", problem.n_states)
     u = ca.SX.sym("u", problem.n_actions)
-    return x, u, symbolic_theta(problem, blocks)
+    return x, u, symbolic_stage(problem, blocks)
+
+
+def _next_state(
+    problem: Problem,
+    symbols: Symbols,
+    x: ca.SX,
+    u: ca.SX,
+) -> tuple[ca.SX, ca.SX]:
+    """`sampled_jacobian` at a stage, whose symbols are those of `symbolic_stage`."""
+    return sampled_jacobian(problem, x, u, symbols["model_parameters"], symbols["disturbance"])
+
+
+def has_prices(problem: Problem) -> bool:
+    """Whether a price differs from stage to stage."""
+    return bool(of_kind(problem.varying, "price"))
+
+
+def _priced_cost(
+    problem: Problem,
+    symbols: Symbols,
+    x: ca.SX,
+    u: ca.SX,
+) -> ca.SX:
+    """γᵏ[ℓ(x, u, d_k, p_k) − ℓ(x, u, d_k, p̄_k)]: what the prices of a stage change of its cost.
+
+    p̄_k is p_k with the prices at their nominal values, which θ's cost stands for.
+    """
+    cost = problem.model.economic_cost
+    disturbance = symbols["disturbance"]
+    present = cost(x, u, disturbance, symbols["model_parameters"])
+    nominal = cost(x, u, disturbance, symbols["nominal_prices"])
+    return symbols["discount"] * (present - nominal)
 
 
 def _curvature(
@@ -234,9 +282,11 @@ def _curvature(
     u: ca.SX,
     chi: ca.SX,
 ) -> ca.SX:
-    """D = ∇²_(x,u) χᵀf(x, u), (n+m, n+m), of the sampled model f."""
-    x_next, _ = sampled_jacobian(problem, x, u, symbols["model_parameters"])
+    """D = ∇²_(x,u) χᵀf(x, u), (n+m, n+m), of the sampled model f, and of what prices change."""
+    x_next, _ = _next_state(problem, symbols, x, u)
     contracted = ca.dot(chi, x_next)
+    if has_prices(problem):
+        contracted += _priced_cost(problem, symbols, x, u)
     hessian, _ = ca.hessian(contracted, ca.vertcat(x, u))
     return hessian
 
@@ -272,10 +322,10 @@ def preparation_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
         "q": (n + m, horizon),
         "L_N": (n, n),
         "q_N": (n, 1),
-        "theta": (blocks.size, 1),
+        "theta": (given_size(problem, blocks), 1),
     }
     arguments = matrix_symbols(shapes)
-    theta = ca.repmat(arguments["theta"], 1, horizon)
+    theta = stage_columns(problem, blocks, arguments["theta"])
     linearise = stage_linearisation(problem, blocks).map(horizon)
     A, B, r = linearise(arguments["x"], arguments["u"], theta)
     A_k = ca.horzsplit(A, n)
@@ -500,7 +550,7 @@ def embedding_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     n = problem.n_states
     m = problem.n_actions
     horizon = problem.horizon
-    symbols = symbolic_theta(problem, blocks)
+    symbols = symbolic_given(problem, blocks)
     s = ca.SX.sym("s", n)
     x_s = ca.DM(problem.reference_state)
     state_scale = ca.DM(problem.scale.state)
@@ -517,12 +567,13 @@ def embedding_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     gradient = condensed["f"] + condensed["F"].T @ xi
     # What the states do with no control; the rows have room for the controls' part.
     free = condensed["Phi"].T @ xi + condensed["g"]
-    lower = (symbols["x_l"] - x_s) / state_scale
-    upper = (symbols["x_u"] - x_s) / state_scale
+    x_l, x_u = state_bounds(problem, symbols)
+    lower = [(bound - x_s) / state_scale for bound in x_l[1:]]
+    upper = [(bound - x_s) / state_scale for bound in x_u[1:]]
     results = {
         "f": gradient,
-        "lower": ca.repmat(lower, horizon, 1) - free,
-        "upper": ca.repmat(upper, horizon, 1) - free,
+        "lower": ca.vertcat(*lower) - free,
+        "upper": ca.vertcat(*upper) - free,
     }
     arguments = {"s": s, "theta": symbols["theta"], **condensed}
     return define("embedding", arguments, results)
@@ -655,39 +706,35 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     state_scale = ca.DM(scale.state)
     price = ca.DM(scale.state_price)
     x_s = ca.DM(problem.reference_state)
-    symbols = symbolic_theta(problem, blocks)
+    symbols = symbolic_given(problem, blocks)
     B_lambda = symbols["B_lambda"]
     b_lambda = symbols["b_lambda"]
     inputs = _readout_symbols(n, m, horizon)
     L_N = inputs["L_N"]
     q_N = inputs["q_N"]
     stages = _stages(inputs)
-    bounds = _SoftBounds(
-        lower=(symbols["x_l"] - x_s) / state_scale,
-        upper=(symbols["x_u"] - x_s) / state_scale,
-        w=symbols["w_sigma"] / price,
-        W=symbols["W_sigma"] * (state_scale / price),
-    )
+    bounds = _soft_bounds(problem, symbols)
+    _, x_u = state_bounds(problem, symbols)
 
     # Forward: states, slack and value. The penalty of s itself is that of the true bounds.
     s = inputs["s"]
     deviation = s - x_s
-    penalty = problem.symbolic_penalty(s)
+    penalty = problem.symbolic_penalty(s, true_bounds(problem, symbols))
     linear = ca.dot(b_lambda, deviation)
     value = inputs["constant"] + penalty + symbols["c_lambda"]
     value += ca.bilin(B_lambda, deviation) + linear
     value /= scale.cost
-    upper = symbols["x_u"] / state_scale
     origin = x_s / state_scale
     xi = [deviation / state_scale]
     slack = []
     for k, stage in enumerate(stages):
         next_xi = stage.next_state(xi[k])
-        below = bounds.lower - next_xi
-        above = next_xi - upper + origin
+        soft = bounds[k]
+        below = soft.lower - next_xi
+        above = next_xi - x_u[k + 1] / state_scale + origin
         t = ca.fmax(below, above)
         t = ca.fmax(t, 0)
-        penalty_of_slack = ca.dot(bounds.w, t) + ca.dot(bounds.W, t**2)
+        penalty_of_slack = ca.dot(soft.w, t) + ca.dot(soft.W, t**2)
         value += stage.cost(xi[k])
         value += problem.discount ** (k + 1) * penalty_of_slack
         xi.append(next_xi)
@@ -753,6 +800,22 @@ def readout(
     }
     definition = readout_definition(problem, blocks)
     return StackedFunction(definition, shared, room=room)
+
+
+def _soft_bounds(problem: Problem, symbols: Symbols) -> list[_SoftBounds]:
+    """Bounds and weights of the states 1 … N, by symbols of `symbolic_given`."""
+    x_s = ca.DM(problem.reference_state)
+    state_scale = ca.DM(problem.scale.state)
+    price = ca.DM(problem.scale.state_price)
+    w = symbols["w_sigma"] / price
+    W = symbols["W_sigma"] * (state_scale / price)
+    x_l, x_u = state_bounds(problem, symbols)
+    bounds = []
+    for lower, upper in zip(x_l[1:], x_u[1:], strict=True):
+        scaled_lower = (lower - x_s) / state_scale
+        scaled_upper = (upper - x_s) / state_scale
+        bounds.append(_SoftBounds(scaled_lower, scaled_upper, w, W))
+    return bounds
 
 
 def _quadratic(hessian: ca.SX, gradient: ca.SX, w: ca.SX) -> ca.SX:
@@ -839,7 +902,7 @@ def _residual(
     L_N: ca.SX,
     xi: Sequence[ca.SX],
     chi: Sequence[ca.SX],
-    bounds: _SoftBounds,
+    bounds: Sequence[_SoftBounds],
 ) -> ca.SX:
     """How far a solution is from optimal, without a unit and without what condensing rounds off.
 
@@ -876,8 +939,8 @@ def _residual(
         projection = _symbolic_projection(pushed, stage.lower, stage.upper)
         errors.append(ca.fabs(v - projection))
 
-        weight = next_discounts[k] * bounds.w
-        soft_bound_error = _soft_bound_error(xi[k + 1], stage.lam / weight, bounds)
+        weight = next_discounts[k] * bounds[k].w
+        soft_bound_error = _soft_bound_error(xi[k + 1], stage.lam / weight, bounds[k])
         errors.append(soft_bound_error)
     return _largest(errors)
 
@@ -1012,6 +1075,11 @@ class GaussNewton:
         self.end_discount = float(problem.discounts[-1])
         # Views of the preparation's memory: what is written to them is in the QP.
         inputs = prepared.inputs
+        self._signal_costs: StackedFunction | None = None
+        if has_prices(problem) or of_kind(problem.varying, "reference"):
+            shared = {"theta": inputs["theta"]}
+            self._signal_costs = StackedFunction(signal_costs(problem, blocks), shared)
+            self.functions["SIGNAL"] = self._signal_costs
         self.L = inputs["L"].reshape(horizon, width, width)
         self.q = inputs["q"].reshape(horizon, width)
         self._L_N = inputs["L_N"].reshape(n, n)
@@ -1028,6 +1096,9 @@ class GaussNewton:
         terminal_gradient = end_discount * parameters["b_Vf"]
         self._L_N[:] = terminal_hessian * self._state_bend
         self._q_N[:] = terminal_gradient * self._state_slope
+        # Of θ alone: what signals change of it is added at each linearisation.
+        self._q_of_theta = self.q.copy()
+        self._q_N_of_theta = self._q_N.copy()
 
     def cost_hessians(self, B: Matrix) -> Vector:
         """Hessians 2γᵏB of the stages' costs γᵏwᵀB w, (N, n+m, n+m), in the model's units."""
@@ -1045,7 +1116,19 @@ class GaussNewton:
         Returns:
             The constant of the stage costs, in the model's unit of cost.
         """
-        return 0.0
+        if self._signal_costs is None:
+            return 0.0
+        self.q[:] = self._q_of_theta
+        return self._add_signal_costs(self._signal_costs, x, u)
+
+    def _add_signal_costs(self, costs: StackedFunction, x: Vector, u: Vector) -> float:
+        """Add what signals change of q and q_N; returns what they change of the constant."""
+        costs.inputs["x"][:] = x.reshape(-1)
+        costs.inputs["u"][:] = u.reshape(-1)
+        costs()
+        self.q += costs.part("q").reshape(self.q.shape)
+        self._q_N[:] = self._q_N_of_theta + costs.part("q_N")
+        return float(costs.part("constant")[0])
 
 
 class Exact(GaussNewton):
@@ -1074,7 +1157,9 @@ class Exact(GaussNewton):
         self._ranges = problem.scale.ranges
         # Over the ranges, and relative to the level of the cost, eigenvalues have no unit.
         self.metric = np.outer(self._ranges, self._ranges) / problem.scale.level
-        self._curvature = StackedFunction(_curvature_by_stage(problem, blocks))
+        # It reads (θ, σ) where the preparation does.
+        shared = {"theta": prepared.inputs["theta"]}
+        self._curvature = StackedFunction(_curvature_by_stage(problem, blocks), shared)
         self.functions["CURVATURE"] = self._curvature
 
     def set_parameters(self, parameters: Parameters) -> None:
@@ -1082,7 +1167,6 @@ class Exact(GaussNewton):
         super().set_parameters(parameters)
         self._B = parameters["B_l"]
         self._b = parameters["b_l"]
-        self._curvature.inputs["theta"][:] = parameters.theta
 
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
         """Write the convexified blocks and the gradients that go with them; see `GaussNewton`."""
@@ -1107,8 +1191,10 @@ class Exact(GaussNewton):
         self.q[:] = gradient * self.slope
         # What is left of the expansion at the reference: ½ pᵀ(L_k − 2γᵏB_l) p of each stage.
         products = point * (by_blocks - by_cost)
-        constant = products.sum() / 2
-        return float(constant)
+        constant = float(products.sum() / 2)
+        if self._signal_costs is not None:
+            constant += self._add_signal_costs(self._signal_costs, x, u)
+        return constant
 
     def _curvatures(self, x: Matrix, u: Matrix, costates: Matrix) -> Vector:
         """Curvature D_k (N, n+m, n+m) of the dynamics along χ̄, at the point given to `fill`."""
@@ -1151,10 +1237,10 @@ def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> Definition:
         "x": (n, horizon),
         "u": (m, horizon),
         "guess": (n, horizon),
-        "theta": (blocks.size, 1),
+        "theta": (given_size(problem, blocks), 1),
     }
     arguments = matrix_symbols(shapes)
-    theta = ca.repmat(arguments["theta"], 1, horizon)
+    theta = stage_columns(problem, blocks, arguments["theta"])
     stages = stage.map(horizon)
     D = stages(
         arguments["x"],
@@ -1163,6 +1249,62 @@ def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> Definition:
         theta,
     )
     return define("curvature", arguments, {"D": D})
+
+
+@built_once
+def signal_costs(problem: Problem, blocks: ThetaBlocks) -> Definition:
+    """What signals change of the linear terms of the QP's costs, and of their constant.
+
+    A reference that moves by Δ_k makes the cost ℓ_θ(w − Δ_k). What prices change of the economic
+    cost is linearised at (x_k, u_k); the exact Hessian has its curvature.
+
+    Args:
+        problem: The problem with its model and scale.
+        blocks: The blocks of θ.
+
+    Returns:
+        Function of x (n, N), u (m, N) and (θ, σ). Its results are q (n+m, N) and q_N (n,), in
+        units of `Problem.scale`, and `constant`, in the model's unit of cost.
+    """
+    n = problem.n_states
+    m = problem.n_actions
+    horizon = problem.horizon
+    scale = problem.scale
+    symbols = symbolic_given(problem, blocks)
+    points = scalar_symbols({"x": (n, horizon), "u": (m, horizon)})
+    references = moved_references(problem, symbols)
+    x, u, at_stage = _linearisation_symbols(problem, blocks)
+    cost = _priced_cost(problem, at_stage, x, u)
+    slope = ca.gradient(cost, ca.vertcat(x, u))
+    expand = ca.Function("priced", [x, u, at_stage["theta"]], [cost, slope])
+
+    constant = ca.SX(0.0)
+    gradients = []
+    discounts = problem.discounts.tolist()
+    theta = symbols["theta"][: blocks.size]
+    for k in range(horizon):
+        point = ca.vertcat(points["x"][:, k], points["u"][:, k])
+        given = ca.vertcat(theta, symbols["sigma"][:, k], discounts[k])
+        value, gradient = expand(point[:n], point[n:], given)
+        constant += value - ca.dot(gradient, point - problem.reference)
+        moved, offset = _moved_cost(symbols["B_l"], symbols["b_l"], references[k])
+        gradients.append(gradient + discounts[k] * moved)
+        constant += discounts[k] * offset
+    moved, offset = _moved_cost(symbols["B_Vf"], symbols["b_Vf"], references[horizon][:n])
+    constant += discounts[horizon] * offset
+    results = {
+        "q": ca.horzcat(*gradients) * ca.repmat(ca.DM(scale.both / scale.cost), 1, horizon),
+        "q_N": discounts[horizon] * moved * ca.DM(scale.state / scale.cost),
+        "constant": constant,
+    }
+    return define("signal_costs", {**points, "theta": symbols["theta"]}, results)
+
+
+def _moved_cost(B: ca.SX, b: ca.SX, by: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Gradient and constant that (w − Δ)ᵀB(w − Δ) + bᵀ(w − Δ) has more than wᵀBw + bᵀw."""
+    gradient = -2 * B @ by
+    constant = ca.bilin(B, by) - ca.dot(b, by)
+    return gradient, constant
 
 
 HESSIANS = {"gauss-newton": GaussNewton, "exact": Exact}

@@ -22,6 +22,7 @@ from controllers.functions import not_in_c
 from controllers.memory import Memory, remember
 from controllers.model import KINDS, Model, discretise
 from controllers.qp import DAQP_FIXED, DAQP_SETTINGS, DAQP_STATUS, Mask
+from controllers.varying import Varying, varying_quantities
 from cosim.core.modules import exception_line, load_plugin
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import Penalty, Scenario
@@ -288,6 +289,7 @@ class Problem:
         reference_action: u_s, (m,).
         reference_cost: ℓ_s.
         substeps: RK4 steps that make a sample of the model.
+        varying: What differs from stage to stage of the horizon.
 
     Raises:
         ModelError: Sizes or values do not fit.
@@ -314,6 +316,7 @@ class Problem:
     reference_action: Vector
     reference_cost: float
     substeps: int = 2
+    varying: tuple[Varying, ...] = ()
 
     def __post_init__(self) -> None:
         for name in VECTORS:
@@ -433,11 +436,21 @@ class Problem:
             self.penalty_quadratic,
         )
 
-    def symbolic_penalty(self, s: ca.SX) -> ca.SX:
-        """The penalty of the true bounds as a CasADi expression of a state (n,)."""
+    def symbolic_penalty(
+        self,
+        s: ca.SX,
+        bounds: tuple[ca.SX, ca.SX] | None = None,
+    ) -> ca.SX:
+        """The penalty of the true bounds as a CasADi expression of a state (n,).
+
+        Args:
+            s: The state.
+            bounds: Lower and upper bounds (n,) in the place of the problem's.
+        """
+        lower, upper = bounds or (self.state_lower, self.state_upper)
         # At most one of the two bounds is violated, so the larger excess is the violation.
-        below = self.state_lower - s
-        above = s - self.state_upper
+        below = lower - s
+        above = s - upper
         violation = ca.fmax(ca.fmax(below, above), 0)
         linear = ca.dot(self.penalty_linear, violation)
         quadratic = ca.dot(self.penalty_quadratic, violation**2)
@@ -479,11 +492,13 @@ class Problem:
             return secrets.token_hex()
         numbers = []
         for item in fields(self):
-            if item.name != "model":
+            if item.name not in ("model", "varying"):
                 value = np.asarray(getattr(self, item.name))
                 numbers.append((item.name, value.tolist()))
         quantities = [getattr(model, kind) for kind in KINDS]
         said = repr((model.name, quantities, model.time_unit, model.uncertain, numbers))
+        if self.varying:
+            said += repr(self.varying)
         return hashlib.sha256((said + function.serialize()).encode()).hexdigest()
 
     def value_level(self, discount: float | None = None) -> float:
@@ -501,8 +516,9 @@ class Problem:
     def from_scenario(cls, scenario: Scenario) -> Problem:
         """Build the problem that a scenario describes; its model is named `module:factory`."""
         settings = scenario.controller
+        model = load_model(settings.model)
         return cls(
-            model=load_model(settings.model),
+            model=model,
             sampling_time=scenario.sampling_time,
             horizon=settings.horizon,
             discount=scenario.discount,
@@ -516,6 +532,7 @@ class Problem:
             reference_action=np.asarray(scenario.reference_action),
             reference_cost=settings.reference_cost,
             substeps=settings.substeps,
+            varying=varying_quantities(scenario, model),
         )
 
 

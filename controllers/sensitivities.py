@@ -23,7 +23,9 @@ from controllers.preparation import (
 from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.reuse import built_once
-from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
+from controllers.stage_symbols import moved_references, stage_columns, symbolic_given
+from controllers.theta import Symbols, ThetaBlocks
+from controllers.varying import of_kind
 from cosim.core.protocols import Matrix
 
 SOLUTION_PARTS = ("xi", "t", "chi", "v", "lam")
@@ -41,7 +43,7 @@ def _theta_lagrangian(
 
     Args:
         problem: The problem.
-        symbols: θ's symbols (`symbolic_theta`).
+        symbols: Symbols of θ and the signals (`symbolic_given`).
         y: Solution in the model's units: `xi` and `chi` (n, N+1), `v` (m, N), the slack `t` and
             the rows' multipliers `lam` (n, N).
         points: Points of linearisation (x, u) in the model's units, (n+m, N).
@@ -60,17 +62,24 @@ def _theta_lagrangian(
     multipliers = ca.horzsplit(y["lam"])
     point = ca.horzsplit(points)
 
+    references = moved_references(problem, symbols)
+    has_moved = bool(of_kind(problem.varying, "reference"))
+
     # λ_θ(ξ_0), then the stages, then V^f_θ(ξ_N).
     terms = _quadratic_form(symbols["B_lambda"], symbols["b_lambda"], xi[0])
     terms += symbols["c_lambda"]
     for k in range(horizon):
         w = ca.vertcat(xi[k], v[k])
+        if has_moved:
+            w -= references[k]
         stage = ca.dot(b_l, w)
         if M is None:
             stage += ca.bilin(B_l, w)
         else:
             # The cost expanded about the point, where B_l enters the lifted block by M too.
             about = point[k] - problem.reference
+            if has_moved:
+                about -= references[k]
             M_k = ca.horzsplit(M, w.numel())[k]
             stage += ca.bilin(B_l, about, 2 * w - about)
             stage += 2 * ca.dot(M_k, B_l)
@@ -89,7 +98,10 @@ def _theta_lagrangian(
         from_above = ca.fmax(lam, 0)
         terms += ca.dot(from_below, symbols["x_l"])
         terms -= ca.dot(from_above, symbols["x_u"])
-    terminal = _quadratic_form(symbols["B_Vf"], symbols["b_Vf"], xi[horizon])
+    end = xi[horizon]
+    if has_moved:
+        end = end - references[horizon][: problem.n_states]
+    terminal = _quadratic_form(symbols["B_Vf"], symbols["b_Vf"], end)
     return terms + gamma**horizon * terminal
 
 
@@ -137,7 +149,7 @@ class _Sensitivities:
             curvature = scalar_symbols(curvature_shapes)
         self.M = curvature.get("M")
 
-        symbols = symbolic_theta(problem, blocks)
+        symbols = symbolic_given(problem, blocks)
         theta = symbols["theta"]
         lagrangian = _theta_lagrangian(
             problem,
@@ -146,7 +158,7 @@ class _Sensitivities:
             ca.vertcat(*points.values()),
             self.M,
         )
-        self.gradient = ca.gradient(lagrangian, theta)
+        self.gradient = ca.gradient(lagrangian, theta)[: blocks.size]
         """All of it but the part of p, which is a sum of a function of one stage."""
 
         self.inputs = {
@@ -289,7 +301,7 @@ class _Sensitivities:
         """Arguments of `stage_parameter_gradient`, those of stage 0, 1, … side by side."""
         problem = self.problem
         horizon = problem.horizon
-        theta = ca.repmat(symbols["theta"], 1, horizon)
+        theta = stage_columns(problem, self.blocks, symbols["theta"])
         action_scale = ca.repmat(ca.DM(problem.scale.action), 1, horizon)
         reference = ca.repmat(ca.DM(problem.reference), 1, horizon)
         xi = symbols["xi"]

@@ -466,7 +466,7 @@ class Parameters(Shown):
 Symbols = dict[str, ca.SX]
 
 
-def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
+def symbolic_theta(problem: Problem, blocks: ThetaBlocks, behind: int = 0) -> Symbols:
     """Symbol `theta` (n_θ,), its blocks by name, and `model_parameters` (n_p,) with θ's own in it.
 
     A slack weight that is no block is the problem's constant.
@@ -474,8 +474,9 @@ def symbolic_theta(problem: Problem, blocks: ThetaBlocks) -> Symbols:
     Args:
         problem: The control problem.
         blocks: The blocks of θ.
+        behind: Entries that `theta` has behind θ's own.
     """
-    theta = ca.SX.sym("theta", blocks.size)
+    theta = ca.SX.sym("theta", blocks.size + behind)
     symbols = {"theta": theta}
     for block in blocks:
         part = theta[blocks.slices[block.name]]

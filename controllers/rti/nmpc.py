@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -47,6 +47,7 @@ from controllers.sensitivities import (
     curvature_directions,
     sensitivities,
 )
+from controllers.stage_symbols import nominal_given
 from controllers.theta import Parameters
 from cosim.core.protocols import CompiledLoop, Matrix, Vector
 from cosim.core.scenario import Scenario
@@ -720,7 +721,9 @@ class RtiNmpc:
             raise ControllerError(f"iterations must be at least 1, not {iterations}")
         self.iterations = iterations
         self.problem = problem
-        self._compilable = hessian == "gauss-newton" and backend == "daqp"
+        # C does not take what differs from stage to stage.
+        in_c = hessian == "gauss-newton" and backend == "daqp"
+        self._compilable = in_c and not problem.varying
         self._make_backend: Callable[[], QpBackend]
         if isinstance(backend, str):
             self._make_backend = partial(make_backend, backend)
@@ -736,6 +739,7 @@ class RtiNmpc:
         # Status of the engine's last preparation.
         self._status = 0
         self._view_memory()
+        self._prepare.inputs["theta"][:] = nominal_given(problem, parameters.theta)
         self.parameters = parameters
         self.functions = INTERPRETED
         self.reset()
@@ -830,7 +834,7 @@ class RtiNmpc:
         self._parameters = parameters
         # All that depends on θ alone is written here; the rest is the next preparation's.
         self._hessian.set_parameters(parameters)
-        self._prepare.inputs["theta"][:] = parameters.theta
+        self._prepare.inputs["theta"][: blocks.size] = parameters.theta
         if "w_sigma" in blocks:
             self._weigh(parameters["w_sigma"], parameters["W_sigma"])
         self._prepared = None
@@ -843,6 +847,42 @@ class RtiNmpc:
     @theta.setter
     def theta(self, theta: ArrayLike) -> None:
         self.parameters = self._parameters.with_theta(theta)
+
+    # signals ------------------------------------------------------------------------------------
+
+    def inform(self, known: Mapping[str, Vector]) -> None:
+        """Take up what is known of the scenario's signals at the sample to come.
+
+        It holds until the next call; before the first one every signal has its nominal value.
+        Beyond its last known value a signal keeps that.
+
+        Args:
+            known: Of each known signal, by its name, its value at the sample and, of a preview, at
+                those after it.
+
+        Raises:
+            ControllerError: A signal of the problem is not among them, or has no finite values.
+        """
+        problem = self.problem
+        if not problem.varying:
+            return
+        sigma = np.empty((problem.horizon + 1, len(problem.varying)))
+        for row, item in enumerate(problem.varying):
+            if item.signal not in known:
+                raise ControllerError(f"nothing is known of the problem's signal '{item.signal}'")
+            values = np.asarray(known[item.signal], dtype=np.float64)
+            if values.ndim != 1 or not values.size or not np.isfinite(values).all():
+                raise ControllerError(
+                    f"signal '{item.signal}' must be known by finite values, its present one first"
+                )
+            count = min(values.size, len(sigma))
+            sigma[:count, row] = values[:count]
+            sigma[count:, row] = values[-1]
+        behind = self._prepare.inputs["theta"][self._parameters.blocks.size :]
+        new = sigma.reshape(-1)
+        if not np.array_equal(behind, new):
+            behind[:] = new
+            self._prepared = None
 
     # the two phases -----------------------------------------------------------------------------
 

@@ -735,6 +735,12 @@ class Scenario(Shown, Table):
         """Names of the signals in records, `signal[price]` say; none without signals."""
         return tuple(f"signal[{signal.name}]" for signal in self.signals or ())
 
+    @property
+    def priced(self) -> tuple[str, ...]:
+        """Names of the FMU's outputs that signals are the prices of."""
+        signals = self.signals or ()
+        return tuple(signal.price_of for signal in signals if signal.price_of is not None)
+
     @cached_property
     def still(self) -> Scenario:
         """The scenario without its signals; itself where it has none."""

@@ -160,9 +160,10 @@ def subject_of(
         lower = float(scenario.action_lower[i])
         upper = float(scenario.action_upper[i])
         pairs.append(_two_values(fmu.variable(name), reference, lower, upper))
+    outputs = (plant.stage_cost, *plant.disturbances, *scenario.priced)
     return Subject(
         fmu=fmu,
-        names=(plant.actions, (plant.stage_cost, *plant.disturbances), plant.states),
+        names=(plant.actions, outputs, plant.states),
         exchanged=(tuple(wiring.inputs), tuple(wiring.outputs), tuple(wiring.states)),
         starts=tuple(wiring.starts),
         start_names=tuple(wiring.start_names),

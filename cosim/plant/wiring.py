@@ -149,8 +149,7 @@ class Wiring:
         self.experiment = experiment(fmu, plant)
         self.outputs = self._number_places((plant.stage_cost, *plant.disturbances), "plant")
         signals = scenario.signals or ()
-        priced = [signal.price_of for signal in signals if signal.price_of is not None]
-        self.outputs += self._number_places(priced, "signal")
+        self.outputs += self._number_places(scenario.priced, "signal")
         self.states = self._number_places(plant.states, "plant.states")
         variables = [sensor.variable for sensor in scenario.sensors or ()]
         self.sensors = self._number_places(variables, "sensor")

@@ -1,0 +1,149 @@
+"""Symbols of θ and of what differs from stage to stage, in one vector.
+
+The values σ of the problem's varying quantities at the stages 0 … N stand behind θ: (θ, σ_0, …,
+σ_N), in the place that θ alone has where nothing varies. So what computes from θ computes from the
+signals too, and a problem without any has the same functions as ever. A function of one stage has
+(θ, σ_k, γᵏ) there.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from controllers.errors import ModelError
+from controllers.problem import Problem
+from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
+from controllers.varying import of_kind
+from cosim.core.protocols import Vector
+
+
+def given_size(problem: Problem, blocks: ThetaBlocks) -> int:
+    """Entries of (θ, σ)."""
+    return blocks.size + len(problem.varying) * (problem.horizon + 1)
+
+
+def nominal_given(problem: Problem, theta: Vector) -> Vector:
+    """(θ, σ) with every varying quantity at its nominal value.
+
+    Args:
+        problem: The problem.
+        theta: θ, (n_θ,).
+    """
+    nominal = [item.nominal for item in problem.varying]
+    return np.concatenate([theta, np.tile(nominal, problem.horizon + 1)])
+
+
+def symbolic_given(problem: Problem, blocks: ThetaBlocks) -> Symbols:
+    """`symbolic_theta` whose `theta` is (θ, σ), and `sigma` (n_σ, N+1)."""
+    count = len(problem.varying)
+    symbols = symbolic_theta(problem, blocks, given_size(problem, blocks) - blocks.size)
+    behind = symbols["theta"][blocks.size :]
+    symbols["sigma"] = ca.reshape(behind, count, problem.horizon + 1)
+    return symbols
+
+
+def symbolic_stage(problem: Problem, blocks: ThetaBlocks) -> Symbols:
+    """`symbolic_theta` whose `theta` is (θ, σ_k, γᵏ), and what the model is given at the stage.
+
+    That are `disturbance` (n_d,), `model_parameters` (n_p,), and `nominal_prices`, the same with
+    each price at its nominal value; and `discount`, γᵏ.
+
+    Raises:
+        ModelError: A varying parameter is one of θ's.
+    """
+    varying = problem.varying
+    symbols = symbolic_theta(problem, blocks, len(varying) + 1 if varying else 0)
+    theta = symbols["theta"]
+    model = problem.model
+    disturbance = ca.SX(ca.DM(model.nominal_disturbance))
+    parameters = symbols["model_parameters"]
+    nominal_prices = ca.SX(parameters)
+    in_theta = blocks.block("p").labels if "p" in blocks else ()
+    for row, item in of_kind(varying, "disturbance", "parameter", "price"):
+        value = theta[blocks.size + row]
+        if item.kind == "disturbance":
+            disturbance[item.place] = value
+            continue
+        name = model.parameters[item.place].name
+        if name in in_theta:
+            raise ModelError(
+                f"signal '{item.signal}' gives the model's parameter {name}, which is in θ too: "
+                "one of both can say what it is"
+            )
+        parameters[item.place] = value
+        if item.kind != "price":
+            nominal_prices[item.place] = value
+    symbols["disturbance"] = disturbance
+    symbols["nominal_prices"] = nominal_prices
+    symbols["discount"] = theta[-1] if varying else ca.SX(1.0)
+    return symbols
+
+
+def stage_columns(problem: Problem, blocks: ThetaBlocks, given: ca.MX) -> ca.MX:
+    """What the functions of the stages 0 … N−1 are given in the place of θ, side by side.
+
+    Args:
+        problem: The problem.
+        blocks: The blocks of θ.
+        given: (θ, σ).
+    """
+    horizon = problem.horizon
+    count = len(problem.varying)
+    if not count:
+        return ca.repmat(given, 1, horizon)
+    theta, behind = ca.vertsplit(given, [0, blocks.size, given.numel()])
+    sigma = ca.reshape(behind, count, horizon + 1)
+    discounts = ca.MX(ca.DM(problem.discounts[:-1]).T)
+    return ca.vertcat(ca.repmat(theta, 1, horizon), sigma[:, :-1], discounts)
+
+
+def state_bounds(problem: Problem, symbols: Symbols) -> tuple[list[ca.SX], list[ca.SX]]:
+    """θ's lower and upper bounds of the states at the stages 0 … N, (n,) each.
+
+    A bound that moves is θ's, moved by as much as the signal is off the scenario's bound: what θ
+    keeps from it is kept.
+
+    Args:
+        problem: The problem.
+        symbols: Of `symbolic_given`.
+    """
+    lower = _moved(problem, symbols, "lower", symbols["x_l"])
+    upper = _moved(problem, symbols, "upper", symbols["x_u"])
+    return lower, upper
+
+
+def true_bounds(problem: Problem, symbols: Symbols) -> tuple[ca.SX, ca.SX] | None:
+    """The scenario's bounds of the present state as they are known, (n,) each; None if none moves.
+
+    Args:
+        problem: The problem.
+        symbols: Of `symbolic_given`.
+    """
+    if not of_kind(problem.varying, "lower", "upper"):
+        return None
+    lower = _moved(problem, symbols, "lower", ca.SX(ca.DM(problem.state_lower)))
+    upper = _moved(problem, symbols, "upper", ca.SX(ca.DM(problem.state_upper)))
+    return lower[0], upper[0]
+
+
+def moved_references(problem: Problem, symbols: Symbols) -> list[ca.SX]:
+    """How far the cost's reference is from the problem's at the stages 0 … N, (n+m,) each."""
+    still = ca.SX.zeros(problem.n_states + problem.n_actions)
+    return _moved(problem, symbols, "reference", still)
+
+
+def _moved(problem: Problem, symbols: Symbols, kind: str, start: ca.SX) -> list[ca.SX]:
+    """A vector at the stages 0 … N, moved by the varying quantities of a kind."""
+    moving = of_kind(problem.varying, kind)  # type: ignore[arg-type]
+    n_stages = problem.horizon + 1
+    if not moving:
+        # One expression for all of them: its C is that of a problem where nothing varies.
+        return [start] * n_stages
+    stages = []
+    for k in range(n_stages):
+        vector = ca.SX(start)
+        for row, item in moving:
+            vector[item.place] += symbols["sigma"][row, k] - item.nominal
+        stages.append(vector)
+    return stages

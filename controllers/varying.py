@@ -1,0 +1,98 @@
+"""What of a problem differs from stage to stage of the horizon, because a signal says so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal, NamedTuple
+
+import casadi as ca
+
+from controllers.errors import ModelError
+from controllers.model import Model
+from cosim.core.scenario import Scenario, SignalTable
+from cosim.core.validation import instead
+
+Kind = Literal["disturbance", "parameter", "price", "lower", "upper", "reference"]
+
+
+class Varying(NamedTuple):
+    """A quantity that differs from stage to stage.
+
+    Attributes:
+        signal: Name of the signal that gives its values.
+        kind: What it is. A `price` is a parameter that the model's economic cost alone depends on.
+        place: Its number among the model's disturbances, its parameters, the states, or (x, u).
+        nominal: Its value where the signal is not known.
+    """
+
+    signal: str
+    kind: Kind
+    place: int
+    nominal: float
+
+
+def varying_quantities(scenario: Scenario, model: Model) -> tuple[Varying, ...]:
+    """What the signals of a scenario that a controller knows of are to its problem.
+
+    Args:
+        scenario: Has the signals, bounds and reference.
+        model: The controller's model.
+
+    Raises:
+        ModelError: A signal names what the model does not have.
+    """
+    quantities = []
+    for table in scenario.signals or ():
+        if table.known == "none":
+            continue
+        if table.model is not None:
+            quantities.append(_of_model(table, table.model, model))
+        elif table.bound is not None:
+            index = scenario.plant.states.index(table.bounded_state)
+            if table.is_lower_bound:
+                nominal = float(scenario.state_lower[index])
+                quantities.append(Varying(table.name, "lower", index, nominal))
+            else:
+                nominal = float(scenario.state_upper[index])
+                quantities.append(Varying(table.name, "upper", index, nominal))
+        elif table.reference is not None:
+            index = (*scenario.plant.states, *scenario.plant.actions).index(table.reference)
+            references = (*scenario.reference_state.tolist(), *scenario.reference_action.tolist())
+            quantities.append(Varying(table.name, "reference", index, references[index]))
+    return tuple(quantities)
+
+
+def _of_model(table: SignalTable, name: str, model: Model) -> Varying:
+    """The disturbance or parameter of a model that a signal is; raises ModelError."""
+    disturbances = [quantity.name for quantity in model.disturbances]
+    parameters = [quantity.name for quantity in model.parameters]
+    if name in disturbances:
+        index = disturbances.index(name)
+        return Varying(table.name, "disturbance", index, model.disturbances[index].nominal)
+    if name in parameters:
+        index = parameters.index(name)
+        kind: Kind = "price" if _is_price(model, index) else "parameter"
+        return Varying(table.name, kind, index, model.parameters[index].nominal)
+    raise ModelError(
+        f"signal '{table.name}': model '{model.name}' has no disturbance or parameter '{name}'"
+        f"{instead(name, (*disturbances, *parameters))}"
+    )
+
+
+def _is_price(model: Model, index: int) -> bool:
+    """Whether a parameter is in the economic cost and not in the dynamics."""
+    symbols = model.symbols()
+    parameter = symbols[3][index]
+    in_dynamics = ca.depends_on(ca.SX(model.ode(*symbols)), parameter)
+    in_cost = ca.depends_on(ca.SX(model.economic_cost(*symbols)), parameter)
+    return bool(in_cost and not in_dynamics)
+
+
+def of_kind(varying: Iterable[Varying], *kinds: Kind) -> list[tuple[int, Varying]]:
+    """The quantities of some kinds, each with its row among all.
+
+    Args:
+        varying: All quantities.
+        kinds: The kinds that are wanted.
+    """
+    return [(row, item) for row, item in enumerate(varying) if item.kind in kinds]

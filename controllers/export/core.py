@@ -17,7 +17,10 @@ from controllers.errors import ControllerError
 from controllers.functions import c_source, not_in_c, work_sizes
 from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions
 from controllers.problem import Problem
+from controllers.stage_symbols import given_size
 from controllers.theta import Parameters
+from controllers.varying import Kind, of_kind
+from cosim.core.protocols import Vector
 from cosim.core.scenario import Scenario
 
 ENGINE_SOURCES = Path(__file__).parent / "sources"
@@ -76,6 +79,11 @@ def core(
         raise ControllerError(
             f"a controller with the model '{problem.model.name}' cannot be exported: {reason}; "
             "write it as expressions or as a table (casadi.interpolant)"
+        )
+    if problem.varying:
+        raise ControllerError(
+            "a problem whose signals are known along the horizon cannot be exported yet: export "
+            "the controller of the same scenario without [[signal]]"
         )
     size = stack_needed(functions)
     if size > STACK_LIMIT:
@@ -185,6 +193,8 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
         "N_W": n + m,
         "HORIZON": problem.horizon,
         "N_THETA": blocks.size,
+        "N_VARYING": len(problem.varying),
+        "N_GIVEN": given_size(problem, blocks),
     }
     for prefix, call in functions.named.items():
         for name, place in call.slices.items():
@@ -226,6 +236,7 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
     }
     if isinstance(rule, Exact):
         arrays["METRIC"] = rule.metric.reshape(-1)
+    arrays |= _moving_bounds(problem)
     arrays["DISCOUNTS"] = problem.discounts[:-1]
     arrays["SLACK_DISCOUNTS"] = problem.discounts[1:]
     array_lines = [_array_text(name, values) for name, values in arrays.items()]
@@ -241,8 +252,24 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
         rule=rule.source,
         solver=(STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER)[0],
         stagewise=str(int(stagewise)),
+        signal_costs=str(int("SIGNAL" in functions.named)),
         **slack,
     )
+
+
+def _moving_bounds(problem: Problem) -> dict[str, Vector]:
+    """For each state the row of the signal that is its bound, −1 without one, and its nominal."""
+    arrays = {}
+    kinds: tuple[Kind, ...] = ("lower", "upper")
+    for kind in kinds:
+        rows = np.full(problem.n_states, -1.0)
+        nominal = np.zeros(problem.n_states)
+        for row, item in of_kind(problem.varying, kind):
+            rows[item.place] = row
+            nominal[item.place] = item.nominal
+        arrays[f"{kind.upper()}_SIGNALS"] = rows
+        arrays[f"{kind.upper()}_NOMINAL"] = nominal
+    return arrays
 
 
 def _filled(template: str, **values: str) -> str:

@@ -721,9 +721,7 @@ class RtiNmpc:
             raise ControllerError(f"iterations must be at least 1, not {iterations}")
         self.iterations = iterations
         self.problem = problem
-        # C does not take what differs from stage to stage.
-        in_c = hessian == "gauss-newton" and backend == "daqp"
-        self._compilable = in_c and not problem.varying
+        self._compilable = hessian == "gauss-newton" and backend == "daqp"
         self._make_backend: Callable[[], QpBackend]
         if isinstance(backend, str):
             self._make_backend = partial(make_backend, backend)
@@ -739,7 +737,6 @@ class RtiNmpc:
         # Status of the engine's last preparation.
         self._status = 0
         self._view_memory()
-        self._prepare.inputs["theta"][:] = nominal_given(problem, parameters.theta)
         self.parameters = parameters
         self.functions = INTERPRETED
         self.reset()
@@ -853,7 +850,7 @@ class RtiNmpc:
     def inform(self, known: Mapping[str, Vector]) -> None:
         """Take up what is known of the scenario's signals at the sample to come.
 
-        It holds until the next call; before the first one every signal has its nominal value.
+        It holds until the next call; after a reset every signal has its nominal value.
         Beyond its last known value a signal keeps that.
 
         Args:
@@ -891,6 +888,7 @@ class RtiNmpc:
         self._x[:] = self.problem.reference_state
         self._u[:] = self.problem.reference_action
         self._costates[:] = 0.0
+        self._prepare.inputs["theta"][:] = nominal_given(self.problem, self.theta)
         self._pending: RtiSolution | None = None
         self._prepared = None
         # A backend may remember: a new one does not.

@@ -1,5 +1,7 @@
 """Signals along the horizon: the QP against one built by hand, derivatives by differences."""
 
+from functools import partial
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import qpsolvers
 from controllers import ControllerError, ConvergedNmpc, Parameters, Problem, RtiNmpc
 from controllers.economic import tune
 from controllers.errors import ModelError
+from controllers.rti import nmpc
 from controllers.theta import ThetaBlocks
 from cosim import Scenario
 
@@ -84,7 +87,7 @@ def next_state(problem, x, u, d, p):
     return x
 
 
-def value_by_hand(problem, theta, point, signals, s):
+def value_by_hand(problem, theta, point, signals, s):  # noqa: PLR0915
     """V(s) and π(s) of the Gauss–Newton QP in x_1 … x_N, u_0 … u_{N−1} and the slack, by quadprog.
 
     In absolute states and actions, whose units are tens, so that no scaling is needed.
@@ -276,7 +279,7 @@ def test_what_is_not_known_or_no_number_is_refused():
         controller.inform({"steam": np.array([600.0, np.nan])})
     unknown = scenario(("steam",)).to_dict()
     unknown["signal"][0]["model"] = "steam_prize"
-    with pytest.raises(ModelError, match="no disturbance or parameter 'steam_prize'.*steam_price"):
+    with pytest.raises(ModelError, match=r"no disturbance or parameter 'steam_prize'.*steam_price"):
         Problem.from_scenario(Scenario.from_dict(unknown))
     with pytest.raises(ModelError, match="UA2, which is in θ too"):
         RtiNmpc(*_with_condenser_in_theta())
@@ -285,3 +288,32 @@ def test_what_is_not_known_or_no_number_is_refused():
 def _with_condenser_in_theta():
     problem = Problem.from_scenario(scenario(("condenser",)))
     return problem, tuned(problem, ("UA2",))
+
+
+@pytest.mark.parametrize("stagewise", [False, True])
+def test_compiled_code_gives_what_the_interpreter_gives(monkeypatch, stagewise):
+    monkeypatch.setenv("COSIM_COMPILE", "now")
+    if stagewise:
+        compiled = partial(nmpc.Engine.compile, stagewise=True)
+        monkeypatch.setattr(nmpc.Engine, "compile", compiled)
+    problem = Problem.from_scenario(scenario())
+    theta = tuned(problem, ("C",))
+    signals = drawn_signals(5)
+    solutions = []
+    for is_compiled in (False, True):
+        controller = RtiNmpc(problem, theta)
+        if is_compiled:
+            controller.compile()
+            if controller.functions != "compiled":
+                pytest.skip("there is no C compiler")
+        controller.inform(signals)
+        controller.prepare_at(moved_point(controller, 5))
+        for a in (None, np.array([200.0, 210.0])):
+            solutions.append(controller.feedback(STATE, a))
+    for one, other in zip(solutions[:2], solutions[2:], strict=True):
+        assert other.iterations is not None
+        assert other.value == pytest.approx(one.value, rel=1e-10)
+        assert other.action == pytest.approx(one.action, rel=1e-10)
+        assert other.value_gradient == pytest.approx(one.value_gradient, rel=1e-8, abs=1e-7)
+    expected = solutions[0].policy_jacobian
+    assert solutions[2].policy_jacobian == pytest.approx(expected, rel=1e-7, abs=1e-9)

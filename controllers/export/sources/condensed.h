@@ -109,8 +109,8 @@ static void rti_guess(const RtiPrepared *prepared, double set[QP_LIMITS]) {
                                              scaled_action(ACTION_UPPER[i], i), 0);
         for (int i = 0; i < N_X; i++)
             set[QP_N + k * N_X + i] = limit_reached(scaled_state(prepared->x[next][i], i),
-                                                    scaled_state(theta[THETA_x_l + i], i),
-                                                    scaled_state(theta[THETA_x_u + i], i), 1);
+                                                    lower_bound(theta, k * N_X + i),
+                                                    upper_bound(theta, k * N_X + i), 1);
     }
 }
 

@@ -15,11 +15,12 @@
 enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE };
 
 /* A QP without its state. Given: the point of linearisation (states x_0 … x_{N−1}, actions, costates
- * χ_1 … χ_N) and θ. `stack` has what `controllers.preparation` makes of it. Doubles only, in the order
+ * χ_1 … χ_N) and θ, behind which are the values σ of signals, N_VARYING for each of the stages 0 … N
+ * (`controllers.stage_symbols`). `stack` has what `controllers.preparation` makes of it. Doubles only, in the order
  * in which Python has them (`controllers.rti.nmpc`). */
 typedef struct {
     double x[HORIZON][N_X], u[HORIZON][N_U];
-    double L[HORIZON * N_W * N_W], q[HORIZON * N_W], L_N[N_X * N_X], q_N[N_X], theta[N_THETA];
+    double L[HORIZON * N_W * N_W], q[HORIZON * N_W], L_N[N_X * N_X], q_N[N_X], theta[N_GIVEN];
     double stack[PREPARED_SIZE];
     double costates[HORIZON][N_X];
     double w[QP_ROWS], W[QP_ROWS], constant;
@@ -71,7 +72,49 @@ static int well_posed(const double theta[]) {
     return 1;
 }
 
+/* How far a signal moves a bound of row r, which is of stage 1 + r / N_X; the signals by state. */
+static inline double moved(const double theta[], int r, const double signals[],
+                           const double nominal[]) {
+    const int i = r % N_X, stage = 1 + r / N_X;
+    if (N_VARYING == 0 || signals[i] < 0.0) return 0.0;
+    return theta[N_THETA + stage * N_VARYING + (int)signals[i]] - nominal[i];
+}
+
+/* The bounds of the states 1 … N, by row. */
+static inline double lower_bound(const double theta[], int r) {
+    const double bound = theta[THETA_x_l + r % N_X] + moved(theta, r, LOWER_SIGNALS, LOWER_NOMINAL);
+    return scaled_state(bound, r % N_X);
+}
+
+static inline double upper_bound(const double theta[], int r) {
+    const double bound = theta[THETA_x_u + r % N_X] + moved(theta, r, UPPER_SIGNALS, UPPER_NOMINAL);
+    return scaled_state(bound, r % N_X);
+}
+
 #include QP_RULE
+
+/* What a function of stage k is given in the place of θ: (θ, σ_k, γᵏ) in `room`, or θ as it is. */
+static inline const double *stage_given(const double theta[], int k, double room[]) {
+    if (N_VARYING == 0) return theta;
+    memcpy(room, theta, N_THETA * sizeof *room);
+    memcpy(room + N_THETA, theta + N_THETA + k * N_VARYING, N_VARYING * sizeof *room);
+    room[N_THETA + N_VARYING] = DISCOUNTS[k];
+    return room;
+}
+
+#if SIGNAL_COSTS
+/* What signals change of the linear terms of the costs, and of their constant. */
+static void rti_signal_costs(RtiPrepared *prepared) {
+    double changes[SIGNAL_SIZE], w[SIGNAL_W + 1];
+    const double *arguments[SIGNAL_ARG] = {prepared->x[0], prepared->u[0], prepared->theta};
+    double *results[SIGNAL_RES] = {changes};
+    long long int iw[SIGNAL_IW + 1];
+    if (signal_costs(arguments, results, iw, w, 0)) changes[0] = NAN;
+    for (int i = 0; i < HORIZON * N_W; i++) prepared->q[i] += changes[SIGNAL_q + i];
+    for (int i = 0; i < N_X; i++) prepared->q_N[i] += changes[SIGNAL_q_N + i];
+    prepared->constant += changes[SIGNAL_constant];
+}
+#endif
 
 /* A_k, B_k and r_k of all stages. Apart, so that CasADi's code has one caller: the loop takes it in,
  * and the compiler makes several stages at a time of it. */
@@ -81,7 +124,9 @@ static QP_APART void rti_linearise(RtiPrepared *prepared) {
     for (int k = 0; k < HORIZON; k++) {
         /* In arrays of its own: gcc 12 has lost results that go through pointers into a larger one. */
         double by_state[N_X * N_X], by_action[N_X * N_U], offset[N_X];
-        const double *arguments[LINEARISE_ARG] = {prepared->x[k], prepared->u[k], prepared->theta};
+        double room[N_THETA + N_VARYING + 1];
+        const double *arguments[LINEARISE_ARG] = {prepared->x[k], prepared->u[k],
+                                                  stage_given(prepared->theta, k, room)};
         double *results[LINEARISE_RES] = {by_state, by_action, offset};
         double w[LINEARISE_W + 1];
         long long int iw[LINEARISE_IW + 1];
@@ -105,6 +150,9 @@ static int rti_prepare(RtiPrepared *prepared) {
     prepared->constant = stage_costs(prepared->x[0], prepared->u[0], prepared->costates[0], theta,
                                      prepared->L, prepared->q);
     terminal_cost(theta, prepared->L_N, prepared->q_N);
+#if SIGNAL_COSTS
+    rti_signal_costs(prepared);
+#endif
     rti_linearise(prepared);
     return rti_assemble(prepared);
 }

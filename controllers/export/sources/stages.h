@@ -378,8 +378,8 @@ static int rti_solve(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solv
                              work->upper[j]);
     }
     for (int r = 0; r < QP_ROWS; r++) {
-        work->lower[QP_N + r] = scaled_state(theta[THETA_x_l + r % N_X], r % N_X);
-        work->upper[QP_N + r] = scaled_state(theta[THETA_x_u + r % N_X], r % N_X);
+        work->lower[QP_N + r] = lower_bound(theta, r);
+        work->upper[QP_N + r] = upper_bound(theta, r);
     }
     if (!all_finite(work->xi, N_X)) return QP_NOT_FINITE;
     const QpStatus status = stages_solve(prepared, work, enforced);
@@ -412,8 +412,8 @@ static void rti_first_rows(const RtiPrepared *prepared, const RtiSolved *solved,
         double unmoved = at.r[i];
         for (int j = 0; j < N_X; j++) unmoved += at.A[i * N_X + j] * scaled_state(solved->s[j], j);
         memcpy(rows[i], at.B + i * N_U, sizeof rows[i]);
-        low[i] = scaled_state(prepared->theta[THETA_x_l + i], i) - unmoved;
-        high[i] = scaled_state(prepared->theta[THETA_x_u + i], i) - unmoved;
+        low[i] = lower_bound(prepared->theta, i) - unmoved;
+        high[i] = upper_bound(prepared->theta, i) - unmoved;
     }
 }
 
@@ -427,10 +427,8 @@ static inline int rti_directions(const RtiPrepared *prepared, const RtiSolved *s
     stages_simulate(prepared, 0, 1, solved->v, work->xi);
     for (int i = 0; i < QP_LIMITS; i++) {
         const int r = i - QP_N;
-        const double low = i < QP_N ? solved->lower[i]
-                                    : scaled_state(prepared->theta[THETA_x_l + r % N_X], r % N_X);
-        const double high = i < QP_N ? solved->upper[i]
-                                     : scaled_state(prepared->theta[THETA_x_u + r % N_X], r % N_X);
+        const double low = i < QP_N ? solved->lower[i] : lower_bound(prepared->theta, r);
+        const double high = i < QP_N ? solved->upper[i] : upper_bound(prepared->theta, r);
         const double y = i < QP_N ? solved->v[i] : work->xi[N_X + r];
         const double reach =
             fabs(i < QP_N ? solved->nu[i] : solved->lam[r]) + qp_max(low - y, y - high);
@@ -466,6 +464,8 @@ static inline int rti_directions(const RtiPrepared *prepared, const RtiSolved *s
                 if (work->mode[i] == QP_AT)
                     work->multiplier[i] += work->weight[i] * stages_value(work, i);
         }
+        /* Multipliers that have not settled give other derivatives: Python solves the KKT system. */
+        if (!(largest <= STAGES_ACCURACY)) return QP_ITERATION_LIMIT;
         for (int j = 0; j < QP_N; j++) dv[a][j] = work->mode[j] == QP_AT ? 0.0 : work->v[j];
         for (int r = 0; r < QP_ROWS; r++) {
             const double moved = work->xi[N_X + r];

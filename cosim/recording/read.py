@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,13 @@ from rerun.error_utils import RerunWarning
 from cosim.core.errors import RecordingError
 from cosim.core.scenario import VIOLATING
 
-TIME, SAMPLE, STATUS = "time", "sample", "/solver/status"
+TIME = "time"
+SAMPLE = "sample"
+STATUS = "/solver/status"
 SIGNAL = "cosim.Signal"
 """Archetype of the static mark (name, unit) on every entity that holds a signal."""
+_NAMES = f"{SIGNAL}:name"
+_UNITS = f"{SIGNAL}:unit"
 _SCALARS = rr.Scalars.descriptor_scalars().component
 _STATE_COLUMN = rr.StateChange.descriptor_state().component
 
@@ -52,30 +56,22 @@ def read_recording(path: str | Path) -> Recording:
 
     Raises RecordingError where there is no such file, or it is no recording of this package.
     """
-    static: dict[str, dict[str, list[str]]] = {}
-    batches: dict[str, list[pa.RecordBatch]] = defaultdict(list)
-    for chunk in _chunks(Path(path)):
-        batch = chunk.to_record_batch()
-        if chunk.is_static:
-            texts = {name: _texts(batch.column(name)) for name in batch.schema.names}
-            static.setdefault(chunk.entity_path, {}).update(texts)
-        elif SAMPLE in batch.schema.names:
-            batches[chunk.entity_path].append(batch)
-    rows_of = {entity: _stacked_rows(parts) for entity, parts in batches.items()}
-    recording = Recording({}, np.empty(0, np.int64), np.empty(0), {}, _properties(static), [], {})
+    static, rows_of = _entities(Path(path))
     # The writer marks an entity of signals by their names; bounds and status are unmarked.
-    marked = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
+    marked = [entity for entity, texts in static.items() if _NAMES in texts]
     if not marked:
         raise RecordingError(f"{path} holds no signals of rti-cosim")
     signals: dict[str, NDArray[np.float64]] = {}
-    samples = recording.samples
-    time = recording.time
-    for entity, texts in marked.items():
-        names = texts[f"{SIGNAL}:name"]
-        units = texts.get(f"{SIGNAL}:unit", [])
+    intermediate: dict[str, NDArray[np.float64]] = {}
+    all_units: dict[str, str] = {}
+    samples = np.empty(0, np.int64)
+    time = np.empty(0)
+    for entity in marked:
+        names = static[entity][_NAMES]
+        units = static[entity].get(_UNITS, [])
         if len(names) != len(units):
             raise RecordingError(f"{path} was recorded by another version of rti-cosim")
-        recording.units.update(zip(names, units, strict=True))
+        all_units.update(zip(names, units, strict=True))
         rows = rows_of.get(entity)
         if rows is None:
             signals |= dict.fromkeys(names, np.empty(0))
@@ -83,18 +79,44 @@ def read_recording(path: str | Path) -> Recording:
         values = _values(rows, len(names))
         moments = _time(rows)
         if entity.startswith("/intermediate/"):
+            # States within a sample have rows of their own, several a sample.
             states = np.column_stack([moments, *values])
             in_time = moments.argsort(kind="stable")
-            recording.intermediate[names[0]] = states[in_time]
+            intermediate[names[0]] = states[in_time]
             continue
         signals |= dict(zip(names, values, strict=True))
         # The entity with the most rows has all samples.
         if len(rows) > len(samples):
             samples = np.asarray(rows[SAMPLE])
             time = moments
-    status = _status(rows_of[STATUS], samples) if STATUS in rows_of else []
-    in_order = dict(sorted(signals.items()))
-    return replace(recording, signals=in_order, samples=samples, time=time, status=status)
+    changes = rows_of.get(STATUS)
+    return Recording(
+        # Entities come in the order in which the file's chunks were written.
+        signals=dict(sorted(signals.items())),
+        samples=samples,
+        time=time,
+        units=all_units,
+        properties=_properties(static),
+        status=[] if changes is None else _status(changes, samples),
+        intermediate=intermediate,
+    )
+
+
+def _entities(path: Path) -> tuple[dict[str, dict[str, list[str]]], dict[str, pa.Table]]:
+    """The static texts of each entity by component, and the rows of each that has any."""
+    static: dict[str, dict[str, list[str]]] = defaultdict(dict)
+    batches: dict[str, list[pa.RecordBatch]] = defaultdict(list)
+    for chunk in _chunks(path):
+        batch = chunk.to_record_batch()
+        columns = batch.schema.names
+        entity = chunk.entity_path
+        if chunk.is_static:
+            for column in columns:
+                static[entity][column] = _texts(batch.column(column))
+        elif SAMPLE in columns:
+            batches[entity].append(batch)
+    rows_of = {entity: _stacked_rows(parts) for entity, parts in batches.items()}
+    return static, rows_of
 
 
 def _properties(static: Mapping[str, Mapping[str, list[str]]]) -> dict[str, str]:
@@ -119,10 +141,14 @@ def worst_moment(path: str | Path) -> float | None:
         return None
     if not len(recording.samples):
         return None
-    where = np.where(np.isfinite(recording.time), recording.time, recording.samples)
+    # A training has no time.
+    timed = np.isfinite(recording.time)
+    moments = np.where(timed, recording.time, recording.samples)
     violation = recording.signals.get("violation", np.zeros(1))
-    violates = np.nanmax(violation, initial=0.0) > VIOLATING
-    return float(where[int(np.nanargmax(violation)) if violates else -1])
+    worst = -1
+    if np.nanmax(violation, initial=0.0) > VIOLATING:
+        worst = int(np.nanargmax(violation))
+    return float(moments[worst])
 
 
 def summarise(path: str | Path) -> dict[str, Any]:
@@ -170,32 +196,46 @@ def _chunks(path: Path) -> list[Chunk]:
 
 def _texts(column: pa.Array) -> list[str]:
     """Values of a static column, as text."""
+    # A static column has one row: a value, or a list of them.
     value: Any = column[0].as_py()
-    return [str(item) for item in value] if isinstance(value, list) else [str(value)]
+    values = value if isinstance(value, list) else [value]
+    return [str(item) for item in values]
 
 
 def _stacked_rows(batches: list[pa.RecordBatch]) -> pa.Table:
     """Rows of an entity, by sample."""
     table = pa.Table.from_batches(batches)
-    return table.take(np.argsort(np.asarray(table[SAMPLE]), kind="stable"))
+    samples = np.asarray(table[SAMPLE])
+    # Stable, since a sample may have several rows (`intermediate`), in the order of time.
+    in_order = np.argsort(samples, kind="stable")
+    return table.take(in_order)
 
 
-def _values(rows: pa.Table, signals: int) -> list[NDArray[np.float64]]:
-    """For each signal of a bundle its values, (K,) or (K, N)."""
+def _values(rows: pa.Table, n_signals: int) -> list[NDArray[np.float64]]:
+    """Values of each signal of an entity, (K,) or (K, N)."""
     flat = pc.list_flatten(rows[_SCALARS]).to_numpy()
     # A row has the numbers of the first signal, then those of the next.
-    by_signal = np.ascontiguousarray(flat.reshape(len(rows), signals, -1).swapaxes(0, 1))
-    return [values[:, 0] if values.shape[1] == 1 else values for values in by_signal]
+    table = flat.reshape(len(rows), n_signals, -1)
+    signals = []
+    for index in range(n_signals):
+        values = np.ascontiguousarray(table[:, index])
+        has_one_number = values.shape[1] == 1
+        signals.append(values[:, 0] if has_one_number else values)
+    return signals
 
 
 def _time(rows: pa.Table) -> NDArray[np.float64]:
+    """Time of the rows in s, (K,), NaN of a training, which has none."""
     if TIME not in rows.schema.names:
         return np.full(len(rows), np.nan)
-    return np.asarray(rows[TIME].cast(pa.int64())) / 1e9
+    nanoseconds = rows[TIME].cast(pa.int64())
+    return np.asarray(nanoseconds) / 1e9
 
 
 def _status(changes: pa.Table, samples: NDArray[np.int64]) -> list[str]:
     """Every sample's status from the changes that were recorded."""
-    texts = [text[0] for text in changes[_STATE_COLUMN].to_pylist()]
-    last = np.searchsorted(np.asarray(changes[SAMPLE]), samples, side="right") - 1
-    return [texts[i] for i in last]
+    words = [states[0] for states in changes[_STATE_COLUMN].to_pylist()]
+    changed_at = np.asarray(changes[SAMPLE])
+    # The last change at or before each sample.
+    following = np.searchsorted(changed_at, samples, side="right")
+    return [words[change] for change in following - 1]

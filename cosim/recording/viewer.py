@@ -21,6 +21,7 @@ from cosim.core.processes import child_process
 from cosim.recording.read import SAMPLE, TIME, existing, worst_moment
 
 LOOPBACK = "127.0.0.1"
+# The port "discard", at which nothing listens.
 _NOWHERE = f"http://{LOOPBACK}:9"
 _PROXIES = ("http_proxy", "https_proxy", "all_proxy")
 _NO_DRIVER = ("No graphics adapter", "Failed to get render context")
@@ -32,10 +33,13 @@ def open_viewer(path: str | Path) -> None:
     Raises RecordingError where there is no such file, no display or no graphics driver.
     """
     command = [*_viewer(), "--port", "auto", str(existing(path))]
-    if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
+    has_display = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    # The systems with one desktop always have a display.
+    if sys.platform == "linux" and not has_display:
         raise RecordingError(f"no display to show {path} on; draw it with --png FILE instead")
     with child_process(command, env=_silent("warn")) as viewer:
         code = viewer.wait()
+    # 130: whoever looks at it ended it by Ctrl-C.
     if code not in (0, 130):
         raise RecordingError(f"the viewer could not show {path}; its messages are above")
 
@@ -81,19 +85,24 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
             recordings = client.get_state().recordings
             if not recordings:
                 raise RecordingError(f"{path} holds no recording")
-            timelines = {line.name for recording in recordings for line in recording.timelines}
+            timelines = set()
+            for recording in recordings:
+                timelines |= {line.name for line in recording.timelines}
             if at is not None and TIME in timelines:
                 client.set_time(TIME, duration=at, play_state="paused")
             elif at is not None:
                 client.set_time(SAMPLE, sequence=round(at), play_state="paused")
-            shots = [b"", client.take_screenshot()]
+            picture = client.take_screenshot()
 
-            def unchanged() -> bool:
-                shots[:] = [shots[1], client.take_screenshot()]
-                return shots[0] == shots[1]
+            def is_unchanged() -> bool:
+                nonlocal picture
+                previous = picture
+                picture = client.take_screenshot()
+                return picture == previous
 
             # Chunks are fetched after loading has ended: two pictures in a row must be equal.
-            _wait(unchanged, deadline, "drawing")
+            _wait(is_unchanged, deadline, "drawing")
+            # The viewer writes a view's errors into the picture, and exits with 0.
             for view in client.get_state().views:
                 for report in view.reports:
                     raise RecordingError(f"view '{view.name}' of {path}: {report.summary}")
@@ -101,7 +110,7 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
         raise RecordingError(
             "the viewer did not answer in time; the machine may be busy: try again"
         ) from error
-    return shots[1]
+    return picture
 
 
 def _viewer() -> list[str]:
@@ -119,20 +128,29 @@ def _silent(level: str) -> dict[str, str]:
     """Environment in which the viewer opens no connection and prints messages from a level on."""
     # Its usage statistics are off in continuous integration; its look for a newer version has no
     # switch, but goes through a proxy, and nothing listens at this one.
-    kept = {name: value for name, value in os.environ.items() if name != "FORCE_RERUN_ANALYTICS"}
-    proxies = dict.fromkeys((*_PROXIES, *(name.upper() for name in _PROXIES)), _NOWHERE)
-    local = {"NO_PROXY": LOOPBACK, "no_proxy": LOOPBACK}
-    return kept | proxies | local | {"CI": "true", "RUST_LOG": level}
+    environment = dict(os.environ)
+    environment.pop("FORCE_RERUN_ANALYTICS", None)
+    environment["CI"] = "true"
+    # Programs read these names in small letters, in capitals, or in both.
+    for name in _PROXIES:
+        environment[name] = _NOWHERE
+        environment[name.upper()] = _NOWHERE
+    environment["no_proxy"] = LOOPBACK
+    environment["NO_PROXY"] = LOOPBACK
+    environment["RUST_LOG"] = level
+    return environment
 
 
 @contextmanager
 def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
     """A viewer process without a window, ended on exit."""
+    # The system gives a port that is free; the viewer does not tell one that it chose itself.
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         port = int(probe.getsockname()[1])
+    width, height = size
     command = [*_viewer(), "--headless", "--hide-welcome-screen", "--port", str(port)]
-    command += ["--window-size", f"{size[0]}x{size[1]}"]
+    command += ["--window-size", f"{width}x{height}"]
     # Messages below an error would be drawn over the views.
     with (
         tempfile.TemporaryFile() as log,
@@ -167,5 +185,8 @@ def _viewer_complaint(log: int) -> str:
             "no graphics driver for drawing without a screen; install a software one, on Debian: "
             "apt-get install libvulkan1 mesa-vulkan-drivers"
         )
-    panics = [line.strip() for line in text.splitlines() if "panicked" in line or "rror" in line]
-    return panics[-1] if panics else "the viewer ended without a message"
+    reason = "the viewer ended without a message"
+    for line in text.splitlines():
+        if "panicked" in line or "rror" in line:
+            reason = line.strip()
+    return reason

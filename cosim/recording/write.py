@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
-from itertools import chain, cycle
+from itertools import chain, cycle, islice
 from math import inf, isfinite
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NoReturn, Self
+from typing import TYPE_CHECKING, NoReturn, Self
 
 import numpy as np
 import rerun as rr
@@ -36,9 +36,13 @@ if TYPE_CHECKING:
 
 SERIES = ("#3B94DE", "#E8731F", "#22AC7E", "#CC79A7", "#E5A11A", "#6CC3F0")
 BOUND_COLOR = "#D8392B"
+# Ranges of the code points that the viewer's font has: Latin, Greek and Cyrillic, dashes.
 _DRAWABLE = ((0x20, 0x24F), (0x370, 0x4FF), (0x2010, 0x2026))
+# The end of a file that is whole has this word in its last bytes.
 _FOOTER = b"RRF2FOOT"
+_FOOTER_BYTES = len(_FOOTER) + 32
 _WRITE_SECONDS = 30.0
+# Streams whose writer does not answer: kept, since dropping one waits for its writer.
 _ABANDONED: list[rr.RecordingStream] = []
 
 AT = rr.TimeRangeBoundary.absolute
@@ -86,6 +90,7 @@ class RerunRecorder:
             units: unit of each FMU variable by name.
         """
         name = controller_name(controller)
+        parameters = getattr(controller, "parameters", None)
         self._seconds = steps * scenario.sampling_time
         self._kinds = {}
         for kind in SIGNALS:
@@ -105,7 +110,7 @@ class RerunRecorder:
             "scenario": scenario.name,
             "scenario_hash": scenario.hash,
             "controller": name,
-            "theta_hash": getattr(getattr(controller, "parameters", None), "hash", "none"),
+            "theta_hash": getattr(parameters, "hash", "none"),
             "seed": seed,
             "steps": steps,
             "sampling_time": f"{scenario.sampling_time:g} s",
@@ -136,20 +141,9 @@ class RerunRecorder:
         # Bounds are lines from the first sample to the last.
         ends = times(samples[[0, -1]], time[[0, -1]])
         self._record_signals(stream, columns, rows, ends)
-        # A solution may be exact, and a failed one has no residual.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            residual = np.log10(columns["residual"])
-        stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
-        self._residual.see(residual)
+        self._record_residual(stream, columns["residual"], rows)
         self._record_status(stream, samples, time, status)
-        for name, channels in self._predicted.items():
-            if name not in columns:
-                continue
-            # (K, stages, n): a channel for each state or action, a line in it for each stage.
-            of_each_entry = np.moveaxis(columns[name], 2, 0)
-            for channel, values in zip(channels, of_each_entry, strict=False):
-                channel.labels = [f"+{stage}" for stage in range(values.shape[1])]
-                stream.send([channel], rows, values)
+        self._record_predictions(stream, columns, rows)
         self._record_intermediate(stream, samples, time)
 
     def _record_signals(
@@ -170,12 +164,48 @@ class RerunRecorder:
                 channels_of.setdefault(channel.entity, []).append(channel)
                 values_of.setdefault(channel.entity, []).append(values)
         for entity, channels in channels_of.items():
-            stream.send(channels, rows, np.column_stack(values_of[entity]), ends)
+            values = np.column_stack(values_of[entity])
+            stream.send(channels, rows, values, ends)
+
+    def _record_residual(
+        self,
+        stream: Stream,
+        residual: Array,
+        rows: list[rr.TimeColumn],
+    ) -> None:
+        """Send the logarithm of the KKT residual, (K,): it ranges over many powers of ten."""
+        # A solution may be exact, and a failed one has no residual.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logarithm = np.log10(residual)
+        self._residual.see(logarithm)
+        scalars = rr.Scalars.columns(scalars=logarithm)
+        stream.rerun.send_columns(_RESIDUAL, rows, scalars)
+
+    def _record_predictions(
+        self,
+        stream: Stream,
+        columns: Mapping[str, Array],
+        rows: list[rr.TimeColumn],
+    ) -> None:
+        """Send what the solutions predict: a channel for each state or action."""
+        for name, channels in self._predicted.items():
+            # A controller need not predict anything.
+            if name not in columns:
+                continue
+            # (K, stages, n) to n times (K, stages): a channel has a line for each stage.
+            entries = np.moveaxis(columns[name], 2, 0)
+            for channel, values in zip(channels, entries, strict=False):
+                n_stages = values.shape[1]
+                channel.labels = [f"+{stage}" for stage in range(n_stages)]
+                stream.send([channel], rows, values)
 
     def _record_status(
         self, stream: Stream, samples: NDArray[np.int64], time: Array, status: Sequence[str]
     ) -> None:
-        """Send the status of the samples at which it is another than before."""
+        """Send the status of the samples at which it is another than before.
+
+        The viewer draws a status until the next one; most runs have one status throughout.
+        """
         changes = []
         for row, word in enumerate(status):
             if word != self._status:
@@ -195,9 +225,9 @@ class RerunRecorder:
         moments, *states = np.array(self._within).T
         self._within.clear()
         # A state at the end of a sample counts to that sample.
-        next_sample = np.searchsorted(time, moments)
-        sample = np.maximum(next_sample - 1, 0)
-        rows = times(samples[sample], moments)
+        next_row = np.searchsorted(time, moments)
+        row = np.maximum(next_row - 1, 0)
+        rows = times(samples[row], moments)
         for channel, values in zip(self._fine, states, strict=True):
             stream.send([channel], rows, values)
 
@@ -231,39 +261,51 @@ class RerunRecorder:
     def _layout(self) -> rrb.Blueprint:
         """Left: states and actions with bounds; middle: costs, causes, solver; right: the rest."""
         along = axis(AT(seconds=0.0), AT(seconds=self._seconds))
-        loop = []
-        for channel in self._group("states", "actions"):
-            shown_channels = [channel]
-            # States within a sample lie in the view of the state, where a run has any.
-            for fine in self._fine:
-                if fine.name == channel.name and fine.window():
-                    shown_channels.append(fine)
-            # What is measured and estimated of a state is drawn over it.
-            known = (f"measured[{channel.name}]", f"estimated[{channel.name}]")
-            for sensor in self._group("sensors"):
-                if sensor.name in known:
-                    shown_channels.append(sensor)
-            loop.append(view(channel.title, shown_channels, along))
-        causes: list[rrb.View] = []
+        left = [self._loop_view(channel, along) for channel in self._group("states", "actions")]
+        middle: list[rrb.View] = []
         for channel in self._group("costs"):
-            causes.append(view(channel.title, [channel], along))
-        causes += [
-            view("disturbances", self._group("disturbances"), along),
-            view("prepare and feedback time [s]", self._group("step_time"), along),
-            view(self._residual.name, [self._residual], along),
-            rrb.StateTimelineView(
-                name="QP status", contents=[f"/{_STATUS_ENTITY}"], time_view=along
-            ),
-        ]
-        right: Any = rrb.TextDocumentView(name="about this run", origin="/about")
-        predicted = []
+            middle.append(view(channel.title, [channel], along))
+        middle.append(view("disturbances", self._group("disturbances"), along))
+        middle.append(view("prepare and feedback time [s]", self._group("step_time"), along))
+        middle.append(view(self._residual.name, [self._residual], along))
+        status = rrb.StateTimelineView(
+            name="QP status",
+            contents=[f"/{_STATUS_ENTITY}"],
+            time_view=along,
+        )
+        middle.append(status)
+        columns = rrb.Horizontal(
+            rrb.Vertical(*left),
+            rrb.Vertical(*middle),
+            self._right_column(along),
+            column_shares=[4, 3, 3],
+        )
+        return layout(columns)
+
+    def _loop_view(self, channel: Channel, along: rrb.TimeAxis) -> rrb.TimeSeriesView:
+        """The plot of a state or an action, with all that is known of it beside its samples."""
+        drawn = [channel]
+        # States within a sample lie in the view of the state, where a run has any.
+        for fine in self._fine:
+            if fine.name == channel.name and fine.window():
+                drawn.append(fine)
+        # What is measured and estimated of a state is drawn over it.
+        known = (f"measured[{channel.name}]", f"estimated[{channel.name}]")
+        for sensor in self._group("sensors"):
+            if sensor.name in known:
+                drawn.append(sensor)
+        return view(channel.title, drawn, along)
+
+    def _right_column(self, along: rrb.TimeAxis) -> rrb.TextDocumentView | rrb.Tabs:
+        """The page about the run, behind the predictions where there are any."""
+        page = rrb.TextDocumentView(name="about this run", origin="/about")
+        predictions = []
         for channel in chain(*self._predicted.values()):
             if channel.window():
-                predicted.append(view(channel.title, [channel], along, legend=False))
-        if predicted:
-            right = rrb.Tabs(rrb.Vertical(*predicted, name="predictions"), right)
-        middle = rrb.Vertical(*causes)
-        return layout(rrb.Horizontal(rrb.Vertical(*loop), middle, right, column_shares=[4, 3, 3]))
+                predictions.append(view(channel.title, [channel], along, legend=False))
+        if not predictions:
+            return page
+        return rrb.Tabs(rrb.Vertical(*predictions, name="predictions"), page)
 
 
 def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:
@@ -273,15 +315,18 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
     colors = cycle(SERIES[first_color:])
     channels = []
     for name, unit in kind.units(scenario, units).items():
-        alone = kind.group in ALONE
+        entity = str(kind.group)
+        if kind.group in ALONE:
+            entity = f"{kind.group}/{escaped(name)}"
         second_of_its_view = name in ("penalty", "feedback_time")
         channel = Channel(
-            entity=f"{kind.group}/{escaped(name)}" if alone else str(kind.group),
+            entity=entity,
             name=name,
             unit=unit,
             color=SERIES[1] if second_of_its_view else next(colors),
             bounds=scenario.limits.get(name, FREE) if kind.vector else FREE,
             step=kind.name in HELD,
+            # The first solves of a run take many times as long as the others.
             tail=0.05 if kind.clock else 0.0,
         )
         channels.append(channel)
@@ -291,7 +336,9 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
 def _predicted_channel(channel: Channel) -> Channel:
     """The prediction of a signal, as it is drawn."""
     return Channel(
-        f"prediction/{escaped(channel.name)}", f"prediction/{channel.name}", channel.unit
+        entity=f"prediction/{escaped(channel.name)}",
+        name=f"prediction/{channel.name}",
+        unit=channel.unit,
     )
 
 
@@ -325,49 +372,82 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
         OSError: if the file cannot be begun.
         RecordingError: if it is not written whole.
     """
-    from cosim.figures.style import lighten, palette  # noqa: PLC0415 - matplotlib: 0.3 s
-
     first, *others = runs.values()
-    colors = {name: lighten(style.color) for name, style in palette(list(runs)).items()}
-    time_of = {}
-    for name, run in runs.items():
-        if "time" in run.signals:
-            time_of[name] = run.signals["time"].values
-        else:
-            time_of[name] = np.arange(float(len(run)))
-    seconds = max((float(time[-1]) for time in time_of.values() if len(time)), default=0.0)
+    time_of = {name: _time_of(run) for name, run in runs.items()}
+    seconds = 0.0
+    for time in time_of.values():
+        if len(time):
+            seconds = max(seconds, float(time[-1]))
     along = axis(AT(seconds=0.0), AT(seconds=seconds))
     last = max(len(run) for run in runs.values()) - 1
     ends = times([0, last], np.array([0.0, seconds]))
     title = " / ".join(runs)
-    overlaid, differences = [], []
+    overlaid = []
+    differences = []
     with Stream(path, title, about) as stream:
-        for signal, of_first in first.signals.items():
+        for signal in first.signals:
+            # Time is the axis of all others.
             if signal == "time" or not all(signal in run.signals for run in others):
                 continue
-            lines = []
-            for name, run in runs.items():
-                line = Channel(
-                    f"{escaped(name)}/{escaped(signal)}",
-                    f"{name}/{signal}",
-                    of_first.unit,
-                    colors[name],
-                    first.bounds.get(signal, FREE) if run is first else FREE,
-                    labels=[name],
-                )
-                time = time_of[name]
-                rows = times(np.arange(len(time)), time)
-                stream.send([line], rows, run.signals[signal].values, ends)
-                lines.append(line)
-            overlaid.append(view(replace(lines[0], name=signal).title, lines, along))
+            lines = _overlaid_lines(runs, signal)
+            for line, (name, run) in zip(lines, runs.items(), strict=True):
+                values = run.signals[signal].values
+                stream.send([line], _sample_times(time_of[name]), values, ends)
+            # The title has the unit and the bounds, but no run's name.
+            titled = replace(lines[0], name=signal)
+            overlaid.append(view(titled.title, lines, along))
+            # A difference of more than two runs would need one to compare with.
             if len(runs) == 2:
-                entity = f"difference/{escaped(signal)}"
-                line = Channel(entity, f"difference/{signal}", of_first.unit, SERIES[3])
-                values = _signal_difference(of_first.values, others[0].signals[signal].values)
-                time = next(iter(time_of.values()))[: len(values)]
-                stream.send([line], times(np.arange(len(values)), time), values)
+                line = _send_difference(stream, first, others[0], signal)
                 differences.append(view(line.title, [line], along))
         stream.layout = _tabs({title: overlaid, "difference": differences})
+
+
+def _send_difference(stream: Stream, one: RunSignals, other: RunSignals, signal: str) -> Channel:
+    """Send a signal of one run less that of the other, and return how it is drawn."""
+    line = Channel(
+        entity=f"difference/{escaped(signal)}",
+        name=f"difference/{signal}",
+        unit=one.signals[signal].unit,
+        color=SERIES[3],
+    )
+    values = _signal_difference(one.signals[signal].values, other.signals[signal].values)
+    time = _time_of(one)[: len(values)]
+    stream.send([line], _sample_times(time), values)
+    return line
+
+
+def _sample_times(time: Array) -> list[rr.TimeColumn]:
+    """Index columns of the samples from the first on, at K times [s]."""
+    return times(np.arange(len(time)), time)
+
+
+def _time_of(run: RunSignals) -> Array:
+    """Time of a run's samples in s, (K,); their numbers where it is not known."""
+    if "time" in run.signals:
+        return run.signals["time"].values
+    return np.arange(float(len(run)))
+
+
+def _overlaid_lines(runs: Mapping[str, RunSignals], signal: str) -> list[Channel]:
+    """A signal's line in each run, in the run's colour."""
+    from cosim.figures.style import lighten, palette  # noqa: PLC0415 - matplotlib: 0.3 s
+
+    styles = palette(list(runs))
+    lines: list[Channel] = []
+    for name, run in runs.items():
+        # The bounds of the others would lie on those of the first.
+        bounds = FREE if lines else run.bounds.get(signal, FREE)
+        line = Channel(
+            entity=f"{escaped(name)}/{escaped(signal)}",
+            name=f"{name}/{signal}",
+            unit=run.signals[signal].unit,
+            color=lighten(styles[name].color),
+            bounds=bounds,
+            labels=[name],
+        )
+        lines.append(line)
+    return lines
 
 
 def _signal_difference(one: Array, other: Array) -> Array:
@@ -402,7 +482,8 @@ def record_training(path: str | Path, training: Training) -> None:
         OSError: if the file cannot be begun.
         RecordingError: if it is not written whole.
     """
-    run, blocks, log = training.run, training.parameters.blocks, training.log()
+    run = training.run
+    log = training.log()
     properties = {
         "algorithm": run.algorithm,
         "scenario": run.scenario.name,
@@ -413,23 +494,26 @@ def record_training(path: str | Path, training: Training) -> None:
     }
     samples = log["samples"].astype(np.int64)
     rows = times(samples)
-    along = axis(AT(seq=0), AT(seq=int(samples[-1]) if len(samples) else 0))
+    last = int(samples[-1]) if len(samples) else 0
+    along = axis(AT(seq=0), AT(seq=last))
     title = f"{run.algorithm} on {run.scenario.name}"
-    about = f"# {title}\n\n{_table('training', properties)}"
-    theta, course = [], []
-    with Stream(path, title, about, properties) as stream:
+    page = f"# {title}\n\n{_table('training', properties)}"
+    blocks = training.parameters.blocks
+    theta_views = []
+    log_views = []
+    with Stream(path, title, page, properties) as stream:
         for name, values in training.theta().items():
             labels = list(blocks.labels[blocks.slices[name]])
             block = Channel(f"increment/{escaped(name)}", f"increment/{name}", labels=labels)
             stream.send([block], rows, values)
-            theta.append(view(f"change of {name}", [block], along))
+            theta_views.append(view(f"change of {name}", [block], along))
         for (name, values), color in zip(log.items(), cycle(SERIES), strict=False):
             # What is not measured at every row is drawn as dots.
             sparse = bool(np.isnan(values).any())
             column = Channel(f"log/{escaped(name)}", name, color=color, points=sparse)
             stream.send([column], rows, values)
-            course.append(view(name, [column], along))
-        stream.layout = _tabs({"θ": theta, "log": course}, SAMPLE)
+            log_views.append(view(name, [column], along))
+        stream.layout = _tabs({"θ": theta_views, "log": log_views}, SAMPLE)
 
 
 # The file, its signals and its layout
@@ -458,19 +542,25 @@ class Channel:
     @property
     def title(self) -> str:
         """Name, unit and bounds in words: the viewer's font has no ≥."""
-        parts = [self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"]
-        for side, bound in zip(("at least", "at most"), self.bounds, strict=True):
-            if isfinite(bound):
-                parts.append(f"{side} {bound:g}")
+        has_unit = self.unit not in ("", "1")
+        parts = [f"{self.name} [{self.unit}]" if has_unit else self.name]
+        lower, upper = self.bounds
+        if isfinite(lower):
+            parts.append(f"at least {lower:g}")
+        if isfinite(upper):
+            parts.append(f"at most {upper:g}")
         return ", ".join(parts)
 
     def see(self, values: Array) -> None:
         """Widen the range seen by values of any shape."""
-        values = values[np.isfinite(values)]
-        if values.size:
-            low, high = self.seen
-            top = np.quantile(values, 1.0 - self.tail) if self.tail else values.max()
-            self.seen = (min(low, float(values.min())), max(high, float(top)))
+        finite = values[np.isfinite(values)]
+        if not finite.size:
+            return
+        bottom = finite.min()
+        # A quantile takes many times as long as a maximum.
+        top = np.quantile(finite, 1.0 - self.tail) if self.tail else finite.max()
+        low, high = self.seen
+        self.seen = (min(low, float(bottom)), max(high, float(top)))
 
     def window(self) -> Range | None:
         """Range of view: the values seen and each bound within their span; None before any."""
@@ -478,8 +568,10 @@ class Channel:
         if low > high:
             return None
         lower, upper = self.bounds
-        # A signal that is constant has a span, too.
-        span = max(high - low, 1e-3 * max(abs(low), abs(high))) or 1.0
+        # A signal that is constant has a span, too, and so has one that is 0.
+        largest = max(abs(low), abs(high))
+        span = max(high - low, 1e-3 * largest) or 1.0
+        # A bound far away would press the signal into a line.
         if low - span <= lower:
             low = min(low, lower)
         if upper <= high + span:
@@ -521,6 +613,7 @@ class Stream:
         described = rr.AnyValues()
         for key, value in properties.items():
             described.with_component_from_data(key, drawable(str(value)))
+        # Rerun refuses a property without values.
         if properties:
             self.rerun.send_property("run", described)
         page = rr.TextDocument(drawable(about), media_type=rr.MediaType.MARKDOWN)
@@ -555,26 +648,39 @@ class Stream:
         for channel, column in zip(channels, columns, strict=True):
             channel.see(column)
             if ends:
-                self._send_bounds(channel, ends)
-        if entity not in self._declared:
-            self._declared.add(entity)
-            names = [channel.name for channel in channels]
-            units = [channel.unit for channel in channels]
-            mark = rr.DynamicArchetype(SIGNAL, components={"name": names, "unit": units})
-            self.rerun.log(entity, mark, _style(channels), static=True)
-        self.rerun.send_columns(entity, times, rr.Scalars.columns(scalars=np.array(values)))
+                lower, upper = channel.bounds
+                self._send_bound(channel, "lower", lower, ends)
+                self._send_bound(channel, "upper", upper, ends)
+        self._declare(entity, channels)
+        self.rerun.send_columns(entity, times, rr.Scalars.columns(scalars=values))
 
-    def _send_bounds(self, channel: Channel, ends: list[rr.TimeColumn]) -> None:
-        """Draw the finite bounds of a signal between two times."""
-        for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
-            if not isfinite(bound):
-                continue
-            entity = f"bounds/{channel.entity}/{side}"
-            line = Channel(entity, f"{side} bound", color=BOUND_COLOR)
-            self.rerun.log(entity, _style([line]), static=True)
-            # The same level at both times makes a line.
-            level = rr.Scalars.columns(scalars=[bound, bound])
-            self.rerun.send_columns(entity, ends, level)
+    def _declare(self, entity: str, channels: Sequence[Channel]) -> None:
+        """Say once of an entity which signals it holds, and how they are drawn."""
+        if entity in self._declared:
+            return
+        self._declared.add(entity)
+        # `read_recording` finds the signals by this mark.
+        names = [channel.name for channel in channels]
+        units = [channel.unit for channel in channels]
+        mark = rr.DynamicArchetype(SIGNAL, components={"name": names, "unit": units})
+        self.rerun.log(entity, mark, _style(channels), static=True)
+
+    def _send_bound(
+        self,
+        channel: Channel,
+        side: str,
+        bound: float,
+        ends: list[rr.TimeColumn],
+    ) -> None:
+        """Draw a signal's lower or upper bound between two times, if it is finite."""
+        if not isfinite(bound):
+            return
+        entity = f"bounds/{channel.entity}/{side}"
+        line = Channel(entity, f"{side} bound", color=BOUND_COLOR)
+        self.rerun.log(entity, _style([line]), static=True)
+        # The same level at both times makes a line.
+        level = rr.Scalars.columns(scalars=[bound, bound])
+        self.rerun.send_columns(entity, ends, level)
 
     def close(self) -> None:
         """Finish the file, with the layout, and give it its name.
@@ -589,9 +695,9 @@ class Stream:
         # Rerun does not say that the disk was full: the file then lacks its footer.
         size = self._partial.stat().st_size
         with self._partial.open("rb") as written:
-            written.seek(-min(len(_FOOTER) + 32, size), os.SEEK_END)
-            complete = _FOOTER in written.read()
-        if not complete:
+            written.seek(-min(_FOOTER_BYTES, size), os.SEEK_END)
+            end = written.read()
+        if _FOOTER not in end:
             self._give_up("its end is missing")
         publish(self._partial, self.path)
 
@@ -622,15 +728,19 @@ class Stream:
 def _style(channels: Sequence[Channel]) -> rr.SeriesLines | rr.SeriesPoints:
     """How the signals of one entity are drawn: their labels, colours, and lines or dots."""
     first = channels[0]
-    labels = first.labels or [channel.title.partition(",")[0] for channel in channels]
-    names = [drawable(label) for label in labels]
     colors = [channel.color for channel in channels]
-    if len(names) > len(colors):
-        colors = [SERIES[i % len(SERIES)] for i in range(len(names))]
+    labels: Sequence[str] = [_legend(channel) for channel in channels]
+    if first.labels:
+        # One signal with several numbers a row: a line for each, all of unlike colours.
+        labels = first.labels
+        if len(labels) > 1:
+            colors = list(islice(cycle(SERIES), len(labels)))
+    names = [drawable(label) for label in labels]
     # An array, since Rerun misreads a list of three numbers as one colour.
     packed = np.array([packed_color(color) for color in colors], dtype=np.uint32)
     if first.points:
-        return rr.SeriesPoints(names=names, colors=packed, marker_sizes=np.full(len(names), 4.0))
+        sizes = np.full(len(names), 4.0)
+        return rr.SeriesPoints(names=names, colors=packed, marker_sizes=sizes)
     mode = rr.components.InterpolationMode
     return rr.SeriesLines(
         names=names,
@@ -642,6 +752,11 @@ def _style(channels: Sequence[Channel]) -> rr.SeriesLines | rr.SeriesPoints:
     )
 
 
+def _legend(channel: Channel) -> str:
+    """A signal's title without its bounds."""
+    return channel.title.partition(",")[0]
+
+
 def packed_color(color: str) -> int:
     """`#RRGGBB` as the opaque 32-bit number that Rerun takes."""
     return int(color.removeprefix("#") + "FF", 16)
@@ -649,12 +764,17 @@ def packed_color(color: str) -> int:
 
 def drawable(text: str) -> str:
     """Replace by `?` each character that the viewer's font lacks: the headless viewer aborts."""
-    return "".join(character if _is_drawable(character) else "?" for character in text)
+    characters = []
+    for character in text:
+        characters.append(character if _is_drawable(character) else "?")
+    return "".join(characters)
 
 
 def _is_drawable(character: str) -> bool:
+    if character == "\n":
+        return True
     code = ord(character)
-    return character == "\n" or any(low <= code <= high for low, high in _DRAWABLE)
+    return any(low <= code <= high for low, high in _DRAWABLE)
 
 
 def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> list[rr.TimeColumn]:
@@ -664,11 +784,13 @@ def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> lis
         samples: their numbers, (K,).
         time: in s, (K,), recorded to 1 ns; None where there is none.
     """
-    columns = [rr.TimeColumn(SAMPLE, sequence=np.asarray(samples, dtype=np.int64))]
-    if time is not None:
-        nanoseconds = np.rint(time * 1e9).astype("timedelta64[ns]")
-        columns.append(rr.TimeColumn(TIME, duration=nanoseconds))
-    return columns
+    numbers = np.asarray(samples, dtype=np.int64)
+    by_sample = rr.TimeColumn(SAMPLE, sequence=numbers)
+    if time is None:
+        return [by_sample]
+    nanoseconds = np.rint(time * 1e9).astype("timedelta64[ns]")
+    by_time = rr.TimeColumn(TIME, duration=nanoseconds)
+    return [by_sample, by_time]
 
 
 def axis(start: rr.TimeRangeBoundary, end: rr.TimeRangeBoundary) -> rrb.TimeAxis:
@@ -731,5 +853,7 @@ def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
 
 
 def _table(title: str, values: Mapping[str, object]) -> str:
-    rows = [(key.replace("_", " "), str(value)) for key, value in values.items()]
+    rows = []
+    for key, value in values.items():
+        rows.append((key.replace("_", " "), str(value)))
     return markdown_table((title, ""), rows)

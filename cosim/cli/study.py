@@ -144,7 +144,7 @@ def _summary(results: cosim.StudyResults) -> dict[str, Any]:
 
 def _show_tables(results: cosim.StudyResults, out_: cli.Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
-    from cosim.studies.report import REPORT_COLUMNS, SHORT_COLUMNS
+    from cosim.studies.report_tables import REPORT_COLUMNS, SHORT_COLUMNS
 
     if columns is None:
         names = list(SHORT_COLUMNS)

@@ -300,9 +300,18 @@ class EndLabel(NamedTuple):
     color: str
 
 
+class CostLine(NamedTuple):
+    """Costs (K,) over samples (K,): name of the case, and arguments of `Axes.plot`."""
+
+    name: str
+    samples: NDArray[np.float64]
+    costs: NDArray[np.float64]
+    look: Mapping[str, Any]
+
+
 def cost_lines(
     axes: Axes,
-    lines: Iterable[tuple[str, NDArray[np.float64], NDArray[np.float64], Mapping[str, Any]]],
+    lines: Iterable[CostLine],
     levels: Mapping[str, float],
     *,
     relative: bool,
@@ -311,7 +320,7 @@ def cost_lines(
 
     Args:
         axes: where they are drawn.
-        lines: name, samples (K,), costs (K,) and style of each line.
+        lines: the costs; each look has a `color`.
         levels: costs to compare with, by name.
         relative: whether costs are regrets in %.
 
@@ -321,9 +330,10 @@ def cost_lines(
     labels = []
     for name, level in levels.items():
         labels.append(EndLabel(shown_case(name), level, REFERENCE))
-    for name, samples, costs, style in lines:
-        axes.plot(samples, costs, **style)
-        labels.append(EndLabel(shown_case(name), float(costs[-1]), style["color"]))
+    for line in lines:
+        axes.plot(line.samples, line.costs, **line.look)
+        end = float(line.costs[-1])
+        labels.append(EndLabel(shown_case(line.name), end, line.look["color"]))
     for level in levels.values():
         axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
     if relative:

@@ -18,6 +18,7 @@ from cosim.figures.style import (
     DASHED,
     ENTRIES,
     INK,
+    CostLine,
     EndLabel,
     cost_lines,
     figure,
@@ -124,12 +125,12 @@ def _draw_cost(
     lines = []
     samples, cost = _known(log, "J")
     if cost.size:
-        lines.append(("training", samples, shown(cost), _LINE | {"marker": "", "color": INK}))
+        look = _LINE | {"marker": "", "color": INK}
+        lines.append(CostLine("training", samples, shown(cost), look))
     samples, cost = _known(log, "greedy_J")
     if cost.size:
-        lines.append(
-            ("greedy", samples, shown(cost), _LINE | {"marker": "o", "color": LEARNED_COLOR})
-        )
+        look = _LINE | {"marker": "o", "color": LEARNED_COLOR}
+        lines.append(CostLine("greedy", samples, shown(cost), look))
     levels = {name: float(shown(level)) for name, level in baselines.items()}
     return cost_lines(axes, lines, levels, relative=best is not None)
 

@@ -1,46 +1,73 @@
-"""Figures of a study: of its tables, and of the runs and logs that it keeps beside them."""
+"""Figures of a study's tables: regrets of the runs, learning curves, regret in operation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from cosim.core.errors import StudyError
 from cosim.core.protocols import Array
-from cosim.core.scenario import VIOLATING, Scenario
-from cosim.core.statistics import regrets, td_error_mean
-from cosim.core.training_options import LOG, PARAMETERS
-from cosim.core.trajectory import Trajectory, read_csv
+from cosim.core.statistics import regrets
 from cosim.figures import style
-from cosim.figures.style import BOUND, DASHED, DotRow, EndLabel, LineStyle, palette, shown_case
-from cosim.figures.training import parameters_figure
-from cosim.figures.trajectory import overlay_figure, trajectory_figure
-from cosim.measurement import built
+from cosim.figures.style import DASHED, DotRow, EndLabel, LineStyle, palette, shown_case
+from cosim.studies.measurements import StudyMeasurements
 from cosim.studies.operation import OperationLayout, OperationResult
-from cosim.studies.plan import StudyPlan
-from cosim.studies.report import FOLDER
-from cosim.studies.run import Run, folder_name, read_table
+from cosim.studies.tables import RUN_KEYS
 
 BANDED = 6
 """Largest number of curves with bands in a panel: more cannot be told apart."""
-Policy = Callable[[Array], Array]
-THETA_PREFIX = "theta "
-"""Of the columns of a log that hold θ."""
-GRID = 13
-"""Points of a phase portrait's arrows in each direction."""
-BINS = 80
-"""Bins of a density, at most."""
+MOST_LEVELS = 4
+"""Baselines that are lines in a figure of curves, at most."""
+PAGE_CHARACTERS = 132
+"""Characters of a legend across the page."""
+TIME_MARKS = {"hour": 1, "shift": 8, "day": 24, "week": 168}
+"""Hours of the times that are marked on an axis of operation."""
+
+
+def _styles(study: StudyMeasurements) -> dict[str, LineStyle]:
+    """The line style of each case, the same in all figures of a study."""
+    return palette(list(study.cases), study.scenarios)
+
+
+# Regrets of the runs
+
+
+def draw_regrets(study: StudyMeasurements, scenario: str) -> Figure | None:
+    """Regrets of all runs on a scenario; None where J* is unknown.
+
+    Args:
+        study: the measurements.
+        scenario: its name.
+    """
+    if study.reference("optimum", scenario) is None:
+        return None
+    optimum = study.about["optimum"][scenario]
+    dots = []
+    for row in study.summary[study.summary.scenario == scenario].to_dict("records"):
+        case = str(row["case"])
+        if case == optimum:
+            continue
+        kind = "regret_iqm" if row["runs"] > 1 else "regret_median"
+        status = study.runs_of(case, scenario).status
+        diverged = status.str.startswith("diverged").to_numpy()
+        dots.append(
+            DotRow(
+                case,
+                values=100 * study.regrets(case, scenario),
+                finished=~diverged,
+                middle=100 * row[kind],
+                low=100 * row[f"{kind}_low"],
+                high=100 * row[f"{kind}_high"],
+            )
+        )
+    return regret_figure(dots, _styles(study)) if dots else None
 
 
 def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Figure:
@@ -58,15 +85,23 @@ def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Fi
         axes = drawn.subplots()
         values = style.dot_rows(axes, rows, styles)
         upper_ends = [row.high for row in rows]
-        shown_values = np.append(values, [0.0, *upper_ends])
-        style.regret_axis(axes, "x", shown_values)
+        style.regret_axis(axes, "x", np.append(values, [0.0, *upper_ends]))
         # An arrow stands where an interval leaves the axes.
-        left = axes.get_xlim()[0]
-        cut = [place for place, row in enumerate(rows) if row.low < left]
-        left_edge = np.full(len(cut), left)
-        axes.plot(left_edge, cut, "<", color=style.INK, markersize=3, clip_on=False)
+        left, _ = axes.get_xlim()
+        cut = [position for position, row in enumerate(rows) if row.low < left]
+        axes.plot(
+            np.full(len(cut), left),
+            cut,
+            "<",
+            color=style.INK,
+            markersize=3,
+            clip_on=False,
+        )
         axes.set_xlabel("regret % of runs (crosses diverged); interquartile mean, 95 % interval")
     return drawn
+
+
+# Learning curves
 
 
 @dataclass(frozen=True)
@@ -82,6 +117,52 @@ class LearningCurve:
     samples: Array
     training: Array
     greedy: Array
+
+
+def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
+    """Learning curves on a scenario; None if no training was evaluated more than once.
+
+    Args:
+        study: the measurements.
+        scenario: its name.
+    """
+    rows = study.curves[study.curves.scenario == scenario]
+    is_training = rows.training_seed.notna()
+    controllers = rows[~is_training].set_index("case").greedy_J
+    trained = rows[is_training]
+    learned = trained[~trained.case.isin(study.baselines)]
+    greedy = trained.dropna(subset="greedy_J").groupby(RUN_KEYS).greedy_J
+    has_course = (greedy.size() > 1).any()
+    if learned.empty or not has_course:
+        return None
+    optimal_cost = float(controllers.get(study.about["optimum"].get(scenario), np.nan))
+    best = optimal_cost if np.isfinite(optimal_cost) else None
+    curves = {}
+    for case, log in learned.groupby("case", sort=False):
+        curves[str(case)] = learning_curve(log, best)
+    at_the_end = greedy.last().groupby("case").median()
+    levels = _levels(study, scenario, pd.concat([controllers, at_the_end]))
+    if best is not None:
+        levels[:] = 100 * regrets(levels.to_numpy(), best)
+    return curves_figure(curves, levels.to_dict(), _styles(study), relative=best is not None)
+
+
+def _levels(study: StudyMeasurements, scenario: str, costs: pd.Series) -> pd.Series:
+    """Greedy costs of the baselines that a figure of curves shows as lines.
+
+    Args:
+        study: the measurements.
+        scenario: its name.
+        costs: greedy cost of each controller, and of each training at its end, by case.
+    """
+    is_baseline = costs.index.isin(study.baselines)
+    # The optimum is where a regret is 0, and no line.
+    is_optimum = costs.index == study.about["optimum"].get(scenario)
+    levels = costs[is_baseline & ~is_optimum & np.isfinite(costs)]
+    levels = levels.sort_values(kind="stable")
+    # Naive is kept, be it the worst: it is where the curves begin.
+    is_naive = levels.index == study.about["naive"].get(scenario)
+    return pd.concat([levels[is_naive], levels[~is_naive]])[:MOST_LEVELS]
 
 
 def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
@@ -142,86 +223,127 @@ def curves_figure(
         relative: whether costs are regrets in %.
     """
     unit = "regret %" if relative else "J"
+    columns = _columns_by_start(curves)
     height = max(2.6, 0.135 * (len(curves) + len(levels)))
-    starts = _by_start(curves)
-    if len(curves) <= BANDED or not 1 < len(starts) < BANDED:
-        starts = {"": list(curves)}
-    legend: dict[str, Line2D] = {}
+    rows = {
+        "training samples": {name: curve.training for name, curve in curves.items()},
+        "greedy policy": {name: curve.greedy for name, curve in curves.items()},
+    }
     with style.figure(2 * height + 0.4) as drawn:
-        grid = drawn.subplots(2, len(starts), sharex=True, sharey="row", squeeze=False)
+        grid = drawn.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
         labels: list[tuple[Axes, list[EndLabel]]] = []
-        for row, kind in zip(grid, ("training samples", "greedy policy"), strict=True):
-            for axes, (start, names) in zip(row, starts.items(), strict=True):
+        for row, (kind, costs) in zip(grid, rows.items(), strict=True):
+            for axes, (start, names) in zip(row, columns.items(), strict=True):
                 panel = {name: curves[name] for name in names}
-                # Beside other panels a case's line says its rule alone.
-                lines = palette(names) if start else styles
-                costs = {
-                    name: curve.training if kind == "training samples" else curve.greedy
-                    for name, curve in panel.items()
-                }
-                medians = _draw_bands(axes, panel, costs, styles, lines)
-                for name, _, _, look in medians:
-                    rule = shown_case(name).replace(start.replace("from", ","), "")
-                    legend.setdefault(rule, Line2D([], [], label=rule, **look))
-                ends = style.cost_lines(axes, medians, levels, relative=relative)
-                if axes is row[-1]:
-                    # The legend below names the rules of several panels.
-                    labels.append((axes, ends[: len(levels)] if start else ends))
-                axes.set_title(start if kind == "training samples" else "")
+                lines = _median_lines(axes, start, panel, costs, styles)
+                ends = style.cost_lines(axes, lines, levels, relative=relative)
+            # The legend below names the rules of several panels; the last one names the levels.
+            labels.append((axes, ends[: len(levels)] if start else ends))
             if relative:
-                intervals = [axes.dataLim.intervaly for axes in row]
-                style.regret_axis(row[0], "y", np.concatenate(intervals))
+                limits = [axes.dataLim.intervaly for axes in row]
+                style.regret_axis(row[0], "y", np.concatenate(limits))
             row[0].set_ylabel(f"{unit} of the {kind}")
+        for axes, start in zip(grid[0], columns, strict=True):
+            axes.set_title(start)
         end = max(float(curve.samples[-1]) for curve in curves.values())
         for axes in grid[1]:
             style.samples_axis(axes, end, "training samples")
-        if len(starts) > 1:
-            widest = max(len(rule) for rule in legend)
-            columns = max(1, 132 // (widest + 10))  # of characters across the page
-            drawn.legend(handles=[*legend.values()], loc="outside lower center", ncols=columns)
+        if len(columns) > 1:
+            _draw_rules_legend(drawn)
         style.label_ends(drawn, labels)
     return drawn
 
 
-def _draw_bands(
+def _columns_by_start(names: Iterable[str]) -> dict[str, list[str]]:
+    """Cases by the title of their column; few cases have one column without a title."""
+    all_names = list(names)
+    columns: dict[str, list[str]] = {}
+    # Cases without a start are in the last column.
+    for name in sorted(all_names, key=lambda name: "start=" not in name):
+        _, _, settings = name.partition("start=")
+        start = settings.rstrip(")").split(" ")[0]
+        title = f"from {start}" if start else "others"
+        columns.setdefault(title, []).append(name)
+    if len(all_names) <= BANDED or not 1 < len(columns) < BANDED:
+        return {"": all_names}
+    return columns
+
+
+def _median_lines(
     axes: Axes,
+    start: str,
     curves: Mapping[str, LearningCurve],
     costs: Mapping[str, Array],
     styles: Mapping[str, LineStyle],
-    lines: Mapping[str, LineStyle],
-) -> list[tuple[str, Array, Array, dict[str, Any]]]:
-    """Draw quartiles of the costs over the runs; return the medians as `cost_lines` takes them.
+) -> list[style.CostLine]:
+    """Medians of costs over the runs as lines to draw; draw their quartiles where they fit.
 
     Args:
-        axes: where they are drawn.
-        curves: curve of each case, for its samples.
+        axes: where the quartiles are drawn.
+        start: title of the column; empty where there is only one.
+        curves: curve of each case of the panel, for its samples.
         costs: costs (R, K) of each case.
-        styles: of which the colours are taken.
-        lines: of which the dashes are taken.
+        styles: line style of each case.
     """
-    medians = []
+    # Beside other panels a case's line says its rule alone.
+    dashes = palette(list(curves)) if start else styles
+    # As it stands in the case's name.
+    start_setting = start.replace("from", ",")
+    lines = []
     for name, curve in curves.items():
-        finite = np.isfinite(costs[name]).all(axis=0)
-        samples = curve.samples[finite]
-        values = costs[name][:, finite]
+        is_finite = np.isfinite(costs[name]).all(axis=0)
+        samples = curve.samples[is_finite]
+        values = costs[name][:, is_finite]
         if not values.size:
             continue
-        low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
+        low, median, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
         color = styles[name].color
-        look: dict[str, Any] = {"color": color, "linestyle": lines[name].line, "linewidth": 1.3}
-        medians.append((name, samples, middle, look))
+        look: dict[str, Any] = {
+            "color": color,
+            "linestyle": dashes[name].line,
+            "linewidth": 1.3,
+            "label": shown_case(name).replace(start_setting, ""),
+        }
+        lines.append(style.CostLine(name, samples, median, look))
         if len(values) > 1 and len(curves) <= BANDED:
             axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
-    return medians
+    return lines
 
 
-def _by_start(names: Iterable[str]) -> dict[str, list[str]]:
-    """Cases by where θ starts, titled so; those without a start are in the last panel."""
-    panels: dict[str, list[str]] = {}
-    for name in sorted(names, key=lambda name: "start=" not in name):
-        start = name.partition("start=")[2].rstrip(")").split(" ")[0]
-        panels.setdefault(f"from {start}" if start else "others", []).append(name)
-    return panels
+def _draw_rules_legend(drawn: Figure) -> None:
+    """Name each rule once, below all panels."""
+    lines: dict[str, Line2D] = {}
+    for axes in drawn.axes:
+        for line in axes.get_lines():
+            rule = str(line.get_label())
+            # matplotlib names lines without a label so.
+            if not rule.startswith("_"):
+                lines.setdefault(rule, line)
+    widest = max(len(rule) for rule in lines)
+    drawn.legend(
+        handles=[*lines.values()],
+        loc="outside lower center",
+        ncols=max(1, PAGE_CHARACTERS // (widest + 10)),
+    )
+
+
+# Regret in operation
+
+
+def draw_operation(study: StudyMeasurements, scenario: str) -> Figure | None:
+    """Regret in operation on a scenario; None where there is no course to draw.
+
+    Args:
+        study: the measurements.
+        scenario: its name.
+    """
+    if scenario not in study.scenarios_in_operation:
+        return None
+    result = study.operation_result(scenario)
+    if result.runs.samples.nunique() == 1:
+        return None
+    layout = study.operation_layout(scenario)
+    return operation_figure(result, layout, _styles(study), study.baselines)
 
 
 def operation_figure(
@@ -244,7 +366,6 @@ def operation_figure(
     runs = result.runs
     if layout.drawn:
         runs = runs[runs.case.isin(layout.drawn)]
-    lines = palette([str(case) for case in runs.case.unique()])
     first = float(runs.samples.min())
     last = float(runs.samples.max())
     titles = {
@@ -254,21 +375,8 @@ def operation_figure(
     all_regrets = 100 * runs[list(titles)].to_numpy(dtype=np.float64)
     with style.figure(3.4) as drawn:
         panels = drawn.subplots(1, 2, sharey=True)
-        for axes, (name, title) in zip(panels, titles.items(), strict=True):
-            labels = []
-            for case, rows in runs.groupby("case", sort=False):
-                spread = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
-                color = styles[str(case)].color
-                if case in baselines:
-                    axes.plot(spread.index, spread["median"], c=color, ls=DASHED, lw=0.9)
-                else:
-                    line = lines[str(case)].line
-                    axes.plot(spread.index, spread["median"], c=color, ls=line, lw=1.5)
-                    axes.fill_between(
-                        spread.index, spread["min"], spread["max"], color=color, alpha=0.12, lw=0
-                    )
-                end = float(spread["median"].iloc[-1])
-                labels.append(EndLabel(shown_case(str(case)), end, color))
+        for axes, (column, title) in zip(panels, titles.items(), strict=True):
+            labels = _draw_regret_courses(axes, runs, column, styles, baselines)
             axes.set_xscale("log")
             axes.set_xlim(first, last)
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -278,8 +386,49 @@ def operation_figure(
             _mark_times(axes, layout.sampling_time, first, last)
             axes.set_title(title, pad=12)
             axes.set_xlabel("samples of the plant")
-        style.label_ends(drawn, [(panels[1], labels)])
+        # The panels share their ordinate: names stand right of the last one.
+        style.label_ends(drawn, [(panels[-1], labels)])
     return drawn
+
+
+def _draw_regret_courses(
+    axes: Axes,
+    runs: pd.DataFrame,
+    column: str,
+    styles: Mapping[str, LineStyle],
+    baselines: Sequence[str],
+) -> list[EndLabel]:
+    """Draw the regret of each case over the samples; return the cases' names for `label_ends`.
+
+    Args:
+        axes: where it is drawn.
+        runs: a row for each run and mark.
+        column: of the regret.
+        styles: of which the colours are taken.
+        baselines: cases with a dashed line and no band.
+    """
+    dashes = palette([str(case) for case in runs.case.unique()])
+    labels = []
+    for group, rows in runs.groupby("case", sort=False):
+        case = str(group)
+        color = styles[case].color
+        spread = 100 * rows.groupby("samples")[column].agg(["min", "median", "max"])
+        samples = spread.index
+        median = spread["median"]
+        if case in baselines:
+            axes.plot(samples, median, color=color, linestyle=DASHED, linewidth=0.9)
+        else:
+            axes.plot(samples, median, color=color, linestyle=dashes[case].line, linewidth=1.5)
+            axes.fill_between(
+                samples,
+                spread["min"],
+                spread["max"],
+                color=color,
+                alpha=0.12,
+                linewidth=0,
+            )
+        labels.append(EndLabel(shown_case(case), float(median.iloc[-1]), color))
+    return labels
 
 
 def _mark_times(axes: Axes, sampling_time: float, first: float, last: float) -> None:
@@ -291,16 +440,16 @@ def _mark_times(axes: Axes, sampling_time: float, first: float, last: float) -> 
         first: least sample of the axis.
         last: largest sample of the axis.
     """
-    for name, hours in {"hour": 1, "shift": 8, "day": 24, "week": 168}.items():
+    for name, hours in TIME_MARKS.items():
         samples = hours * 3600.0 / sampling_time
         if not first <= samples <= last:
             continue
         # Near an edge the name is set inwards.
-        share = np.log(samples / first) / np.log(last / first)
+        position = np.log(samples / first) / np.log(last / first)
         side = "center"
-        if share < 0.06:
+        if position < 0.06:
             side = "left"
-        elif share > 0.94:
+        elif position > 0.94:
             side = "right"
         axes.axvline(samples, color=style.REFERENCE, linewidth=0.7, linestyle=(0, (1, 2)))
         axes.annotate(
@@ -315,322 +464,9 @@ def _mark_times(axes: Axes, sampling_time: float, first: float, last: float) -> 
         )
 
 
-def draw_kept(plan: StudyPlan, out: Path, formats: Sequence[str] = style.FORMATS) -> list[str]:
-    """Draw the trajectories and logs that a study keeps.
-
-    Args:
-        plan: the study's plan, which names the kept files.
-        out: the study's folder, or its stored one; the figures are written to `out`/figures.
-        formats: of the files, as in `save_set`.
-
-    Returns:
-        Names of the figures.
-
-    Raises:
-        StudyError: if a phase portrait needs θ of a training that `out` does not hold.
-    """
-    drawn = chain(_trajectory_figures(plan, out), _training_figures(plan, out))
-    return style.save_set(drawn, out / FOLDER, formats)
-
-
-def _trajectory_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]]:
-    """Names and figures of the kept trajectories."""
-    for name, scenario in plan.definition.scenarios.items():
-        for table in plan.definition.table.trajectory:
-            runs: dict[str, Run] = {}
-            trajectories: dict[str, Trajectory] = {}
-            for run in plan.runs:
-                kept = run.kept.get(table.file)
-                if run.scenario.name != name or kept is None or not (out / kept).is_file():
-                    continue
-                runs[run.case] = run
-                trajectory = read_csv(out / kept, scenario)
-                trajectories[run.case] = replace(trajectory, controller=run.case)
-            if not trajectories:
-                continue
-            for kind in table.figures:
-                stem = f"{kind}-{folder_name(name)}-{table.name}"
-                if kind == "trajectory":
-                    beside = list(trajectories.values())
-                    for case, trajectory in trajectories.items():
-                        drawn = trajectory_figure(trajectory, scenario, beside=beside)
-                        yield f"{stem}-{folder_name(case)}", drawn
-                elif kind == "overlay":
-                    yield stem, overlay_figure(trajectories)
-                elif kind == "density":
-                    yield stem, density_figure(trajectories, scenario)
-                else:
-                    policies = {case: _policy(run, out) for case, run in runs.items()}
-                    yield stem, phase_figure(trajectories, policies, scenario)
-
-
-def _training_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]]:
-    """Names and figures of the kept logs; a run in operation has none."""
-    for run in plan.runs:
-        kept = run.kept.get(LOG)
-        if run.marks or kept is None or not (out / kept).is_file():
-            continue
-        log = read_table(out / kept)
-        blocks = increments(log)
-        # A log without θ has nothing to draw.
-        if not blocks:
-            continue
-        samples = log["samples"].to_numpy(float)
-        updates = log["updates"].to_numpy(float)
-        td_error = log["td_error"].to_numpy(float)
-        windowed_error = td_error_mean(samples, td_error, updates)
-        drawn = parameters_figure(samples, blocks, windowed_error)
-        yield f"parameters-{Path(kept).stem}", drawn
-
-
-def increments(log: pd.DataFrame) -> dict[str, Array]:
-    """θ less its first row by block, (K, entries), of a training's log of K rows."""
-    theta = log.filter(like=THETA_PREFIX).astype(float)
-    changes = theta - theta.iloc[0]
-    entries: dict[str, list[Array]] = {}
-    for column in theta:
-        # A column is called `theta BLOCK[i,j]`.
-        entry = str(column).removeprefix(THETA_PREFIX)
-        block = entry.partition("[")[0]
-        values = changes[column].to_numpy()
-        entries.setdefault(block, []).append(values)
-    return {block: np.column_stack(columns) for block, columns in entries.items()}
-
-
-def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure:
-    """Density of the first state against its lower bound, a line for each controller.
-
-    The bins are common and an edge lies on the bound, so that no bin mixes both sides; the axis
-    leaves out the outermost 0.1 % of all samples. The legend gives the share that violates it.
-
-    Args:
-        runs: trajectory of each controller.
-        scenario: of the plant.
-    """
-    name = scenario.plant.states[0]
-    bound = float(scenario.state_lower[0])
-    unit = next(iter(runs.values())).signals[name].unit
-    samples = {case: run[name] for case, run in runs.items()}
-    edges, width = _common_bins(list(samples.values()), bound)
-    styles = palette(list(samples))
-    with style.figure(2.9, 4.6) as drawn:
-        axes = drawn.subplots()
-        for case, values in samples.items():
-            violates = bound - values > VIOLATING
-            share = 100 * float(np.mean(violates))
-            counts = np.histogram(values, edges)[0]
-            heights = counts / (len(values) * width)
-            color = styles[case].color
-            axes.stairs(heights, edges, fill=True, alpha=0.12, color=color)
-            text = f"{shown_case(case)}: {share:.1f} % below"
-            axes.stairs(heights, edges, color=color, linewidth=1.2, label=text)
-        axes.axvline(bound, color=BOUND, linewidth=1.1, linestyle=DASHED, label="bound")
-        axes.set_xlim(edges[0], edges[-1])
-        axes.set_ylim(bottom=0.0)
-        axes.set_xlabel(style.label(name, unit))
-        axes.set_ylabel(_density_label(unit))
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.2)
-    return drawn
-
-
-def _density_label(unit: str) -> str:
-    """Label of a density over a quantity with a unit."""
-    if unit in ("", "1"):
-        return "density"
-    # Without brackets 1/kg/min would read as a division by both.
-    inverse = f"1/({unit})" if "/" in unit else f"1/{unit}"
-    return f"density [{inverse}]"
-
-
-def _common_bins(samples: Sequence[Array], bound: float) -> tuple[Array, float]:
-    """Edges of bins for several histograms, of which one is `bound`, and the bins' width."""
-    all_samples = np.concatenate(samples)
-    low = min(float(np.quantile(all_samples, 0.001)), bound)
-    high = max(float(np.quantile(all_samples, 0.999)), bound)
-    width = (high - low) / BINS
-    # Not narrower than the smallest sample can fill (Freedman and Diaconis' rule).
-    for values in samples:
-        lower_quartile, upper_quartile = np.quantile(values, (0.25, 0.75))
-        spread = upper_quartile - lower_quartile
-        width = max(width, float(2 * spread / np.cbrt(len(values))))
-    # All samples may be one number.
-    if not width:
-        width = 1e-3 * max(abs(bound), 1.0)
-    # Edges are whole widths from the bound, one bin more than needed on either side.
-    below = -np.ceil((bound - low) / width) - 1
-    above = np.ceil((high - bound) / width) + 2
-    edges: Array = bound + width * np.arange(below, above)
-    return edges, width
-
-
-def phase_figure(
-    runs: Mapping[str, Trajectory], policies: Mapping[str, Policy], scenario: Scenario
-) -> Figure:
-    """Phase portraits, a panel for each controller: where the state lives, and its policy there.
-
-    Background: density of the visited states, logarithmic. Arrows: the policy as a vector field,
-    (π(s) − u_s)/(u_u − u_l), right where the first input rises and up where the second does; an
-    arrow's length goes with the root of its size. Red: bounds. Cross: operating point.
-
-    Args:
-        runs: trajectory of each controller.
-        policies: action (m,) of each controller in a state (n,).
-        scenario: of the plant, with two states and two inputs.
-    """
-    visited = np.concatenate([run.states for run in runs.values()])
-    low, high = np.quantile(visited, (0.001, 0.999), axis=0)
-    x = np.linspace(low[0], high[0], GRID)
-    y = np.linspace(low[1], high[1], GRID)
-    fields = {case: _field(policy, x, y, scenario) for case, policy in policies.items()}
-    # Arrows of all panels have one scale, so that policies can be compared.
-    longest = _longest_arrow(list(fields.values()))
-    # Policies that stay at the operating point have no arrows to scale.
-    arrow_scale = longest or 1.0
-    columns = 2 if len(runs) == 4 else min(len(runs), 3)
-    rows = -(-len(runs) // columns)
-    # The axes reach half a cell beyond the outermost arrows.
-    half_x = 0.5 * (x[1] - x[0])
-    half_y = 0.5 * (y[1] - y[0])
-    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
-    signals = next(iter(runs.values())).signals
-    operating_point = scenario.reference_state[:2]
-    height = 7.0 / columns * rows + 0.4
-    width = style.WIDTH if columns > 1 else 4.2
-    with style.figure(height, width) as drawn:
-        grid = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        for axes in grid.flat[len(runs) :]:
-            axes.set_visible(False)
-        for axes, (case, run) in zip(grid.flat, runs.items(), strict=False):
-            _draw_density(axes, run.states[:, :2], extent)
-            _draw_arrows(axes, x, y, fields[case] / arrow_scale)
-            axes.plot(
-                operating_point[0],
-                operating_point[1],
-                "+",
-                color=BOUND,
-                markersize=9,
-                markeredgewidth=1.6,
-                zorder=5,
-            )
-            _draw_bounds(axes, scenario)
-            axes.set_title(shown_case(case))
-            axes.set_xlim(extent[:2])
-            axes.set_ylim(extent[2:])
-        states = [style.label(name, signals[name].unit) for name in scenario.plant.states[:2]]
-        for axes in grid[-1]:
-            axes.set_xlabel(states[0])
-        for axes in grid[:, 0]:
-            axes.set_ylabel(states[1])
-        first, second = (style.label(name, "") for name in scenario.plant.actions[:2])
-        drawn.supxlabel(
-            f"arrows: input less its operating point, right {first}, up {second}; the longest is "
-            f"{100 * longest:.0f} % of the input range\ncolour: how often the state was there, "
-            "logarithmic; red: bounds; cross: operating point",
-            fontsize=7.0,
-        )
-    return drawn
-
-
-def _longest_arrow(fields: Sequence[Array]) -> float:
-    """Largest length in fields (Y, X, 2); an action that is NaN has none."""
-    longest = 0.0
-    for field in fields:
-        lengths = np.hypot(field[..., 0], field[..., 1])
-        longest = max(longest, float(np.nanmax(lengths)))
-    return longest
-
-
-def _draw_bounds(axes: Axes, scenario: Scenario) -> None:
-    """Draw the bounds of the first two states, across and upright."""
-    look: dict[str, Any] = {"color": BOUND, "linewidth": 1.0, "linestyle": DASHED, "zorder": 3}
-    for bounds in (scenario.state_lower, scenario.state_upper):
-        axes.axvline(bounds[0], **look)
-        axes.axhline(bounds[1], **look)
-
-
-def _field(policy: Policy, x: Array, y: Array, scenario: Scenario) -> Array:
-    """First two inputs of a policy less the operating point, in shares of their range.
-
-    Args:
-        policy: of the state, (n,).
-        x: first state of the grid, (X,).
-        y: second state of the grid, (Y,).
-        scenario: of the plant, with two states.
-
-    Returns:
-        The field, (Y, X, 2).
-    """
-    # Inputs of unlike units become comparable as shares of their range.
-    input_range = scenario.action_upper - scenario.action_lower
-    actions = np.empty((len(y), len(x), 2))
-    for row, second in enumerate(y):
-        for column, first in enumerate(x):
-            state = np.array([first, second])
-            actions[row, column] = policy(state)[:2]
-    from_operating_point = actions - scenario.reference_action[:2]
-    field: Array = from_operating_point / input_range[:2]
-    return field
-
-
-def _draw_arrows(axes: Axes, x: Array, y: Array, field: Array) -> None:
-    """Draw a field (Y, X, 2) on a grid as arrows, whose length goes with the root of its size."""
-    size = np.hypot(field[..., 0], field[..., 1])
-    # Divided by the root of its size: else small arrows could not be seen beside large ones.
-    shrink = 1.0 / np.sqrt(np.where(size > 0, size, 1.0))
-    axes.quiver(
-        *np.meshgrid(x, y),
-        field[..., 0] * shrink,
-        field[..., 1] * shrink,
-        angles="uv",
-        pivot="mid",
-        scale=1.05 * max(len(x), len(y)),
-        scale_units="width",
-        width=0.004,
-        color="#1A1A1A",
-        zorder=4,
-    )
-
-
-def _draw_density(axes: Axes, states: Array, extent: tuple[float, float, float, float]) -> None:
-    """Draw how often a run of states (K, 2) was where, within left, right, bottom and top."""
-    left, right, bottom, top = extent
-    x = states[:, 0]
-    y = states[:, 1]
-    inside = (x > left) & (x < right) & (y > bottom) & (y < top)
-    cells = axes.hexbin(
-        x[inside],
-        y[inside],
-        gridsize=40,
-        extent=extent,
-        mincnt=1,
-        linewidths=0.1,
-        zorder=1,
-    )
-    counts = cells.get_array()
-    if counts is not None and counts.size:
-        # The upper part of the map is left out: arrows must stay legible on it.
-        cells.set(cmap="YlGnBu", norm=LogNorm(0.7, 20.0 * float(counts.max())))
-
-
-def _policy(run: Run, out: Path) -> Policy:
-    """Action (m,) of a run's controller in a state (n,); raises StudyError where its θ is gone."""
-    theta = ""
-    if run.training is not None:
-        path = out / run.folder / PARAMETERS
-        if not path.is_file():
-            raise StudyError(
-                f"the phase portrait of '{run.case}' needs its θ, and there is no '{path}'; "
-                "run the study again"
-            )
-        theta = path.read_text("utf-8")
-    controller = built(run.source(theta), run.scenario)
-
-    def act(s: Array) -> Array:
-        controller.reset()
-        # One QP from a cold guess is not the policy: let a real-time iteration settle.
-        for _ in range(5):
-            controller.prepare()
-            action = controller.feedback(s).action
-        return action
-
-    return act
+STUDY_FIGURES: dict[str, Callable[[StudyMeasurements, str], Figure | None]] = {
+    "curves": draw_curves,
+    "regret": draw_regrets,
+    "operation": draw_operation,
+}
+"""What draws each kind of figure of a scenario."""

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
+from cosim.core.protocols import Array
+from cosim.core.statistics import paired_difference
+
 
 def shared_ranks(
     cases: Sequence[str],
@@ -35,3 +38,23 @@ def shared_ranks(
             rank = place
         ranks[case] = rank
     return ranks
+
+
+def costs_more(cost: Array, other: Array, optimum: Array) -> bool:
+    """Whether paired runs are shown to cost more: the interval of the difference is above zero.
+
+    Args:
+        cost: J of each run and noise seed, (R, S).
+        other: J' of the counterparts, (R, S).
+        optimum: J* on the same noise, (S,).
+
+    Returns:
+        False, too, where nothing is known: without a pair, or without an interval.
+    """
+    if not cost.size:
+        return False
+    _, interval, _ = paired_difference(cost, other, optimum)
+    if interval is None:
+        return False
+    low, _ = interval
+    return low > 0

@@ -17,12 +17,14 @@ from cosim.core.files import read_toml, write_atomically
 from cosim.core.scenario import Table
 from cosim.core.validation import instead, validated
 from cosim.evaluation import EVALUATION, TIMING
-from cosim.studies import figures
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
+from cosim.studies.kept import draw_kept
 from cosim.studies.plan import LOGS, THETA, TRAJECTORIES, Study, plan
 from cosim.studies.report import FOLDER, rendered
-from cosim.studies.results import (
+from cosim.studies.results import StudyResults
+from cosim.studies.run import GREEDY, RUNS_FOLDER, frame_csv
+from cosim.studies.tables import (
     ABOUT,
     AGGREGATE,
     CURVES,
@@ -31,9 +33,7 @@ from cosim.studies.results import (
     RUNS_TABLE,
     SUMMARY,
     WHERE,
-    StudyResults,
 )
-from cosim.studies.run import GREEDY, RUNS_FOLDER, frame_csv
 
 TOLERANCES = "tolerances.toml"
 DIGITS = 8
@@ -134,7 +134,7 @@ def draw_stored(folder: Path, name: str) -> list[str]:
     for of_scenario in results.draw(stored / FOLDER, ("svg",)).values():
         names += of_scenario
     if results.about["pictures"]:  # of the trajectories and logs that the study keeps
-        names += figures.draw_kept(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
+        names += draw_kept(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
     return names
 
 

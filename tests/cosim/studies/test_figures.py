@@ -5,14 +5,10 @@ import pandas as pd
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
+from cosim.figures.states import density_figure
 from cosim.figures.style import lighten, palette, shown_case
-from cosim.studies.figures import (
-    LearningCurve,
-    curves_figure,
-    density_figure,
-    increments,
-    learning_curve,
-)
+from cosim.studies.figures import LearningCurve, curves_figure, learning_curve
+from cosim.studies.kept import increments
 from tests.helpers.loop import Proportional
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import StudyError
-from cosim.studies.results import RUN_KEYS, StudyResults
+from cosim.studies.results import StudyResults
 from cosim.studies.run import frame_csv
+from cosim.studies.tables import RUN_KEYS
 from tests.helpers.toy_study import GROW, run_toy
 
 ROOT = Path(__file__).parents[3]

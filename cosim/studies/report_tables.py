@@ -1,0 +1,286 @@
+"""Tables of a study as texts: of a scenario, of all scenarios, of the paper, of runs and cases."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cosim.core import statistics
+from cosim.core.errors import StudyError
+from cosim.core.protocols import Array
+from cosim.core.result import TextTable
+from cosim.core.statistics import shown
+from cosim.core.validation import instead
+from cosim.studies.measurements import StudyMeasurements, columns_of
+from cosim.studies.operation import operation_tables
+
+TitledRows = tuple[Sequence[str], list[list[str]]]
+"""Header of a table and its rows of texts."""
+
+REPORT_COLUMNS = {
+    "case": "case",
+    "rank": "rank",
+    "samples": "plant samples",
+    "finished": "finished",
+    "regret": "regret %, median [95 %]",
+    "worst": "worst [95 %]",
+    "iqm": "IQM [95 %]",
+    "J": "J, median",
+    "J-worst": "J, worst",
+    "gap": "gap closed %",
+    "economic": "economic cost",
+    "violation": "violation",
+    "violating": "violating %",
+    "week": "violations a week [95 %]",
+    "against": "against",
+    "difference": "difference % [95 %]",
+    "p": "p",
+}
+"""Titles of the columns of a scenario's table, by the names that options take."""
+SHORT_COLUMNS = ("case", "rank", "regret", "worst", "finished")
+"""Columns that fit a terminal of 80 characters."""
+DIFFERENCE_COLUMNS = ("against", "difference", "p")
+"""Columns of the paired difference from a case's counterpart."""
+
+PAPER = {"naive": 21.0, "tuned": 15.0}
+"""Gain of the paper's RL-tuned RTI-NMPC over (a) and (b), in per cent."""
+NEAR = 3.0
+"""Per cent within which a gain agrees with the paper's, which are approximate."""
+
+
+def scenario_table(
+    study: StudyMeasurements, scenario: str, columns: Sequence[str] | None = None
+) -> TitledRows:
+    """The table of a scenario, lowest J first.
+
+    Args:
+        study: the measurements.
+        scenario: its name.
+        columns: keys of `REPORT_COLUMNS`; by default all of which something is known.
+
+    Raises:
+        StudyError: there is no such column.
+    """
+    if columns is None:
+        columns = _known_columns(study, scenario)
+    for name in columns:
+        if name not in REPORT_COLUMNS:
+            raise StudyError(f"a table has no column '{name}'{instead(name, REPORT_COLUMNS)}")
+    titles = [REPORT_COLUMNS[name] for name in columns]
+    of_scenario = study.summary[study.summary.scenario == scenario]
+    rows = []
+    for summary in of_scenario.to_dict("records"):
+        cells = _summary_cells(summary | _printed_intervals(study, summary))
+        rows.append([cells[name] for name in columns])
+    return titles, rows
+
+
+def _known_columns(study: StudyMeasurements, scenario: str) -> list[str]:
+    """Columns of a scenario's table of which the study knows something."""
+    columns = list(REPORT_COLUMNS)
+    if not any(case.get("against") for case in study.cases.values()):
+        for name in DIFFERENCE_COLUMNS:
+            columns.remove(name)
+    if study.sampling_time(scenario) is None:
+        columns.remove("week")
+    return columns
+
+
+def _printed_intervals(study: StudyMeasurements, summary: Mapping[str, Any]) -> dict[str, float]:
+    """What a printed row shows beside its columns of the summary."""
+    case = summary["case"]
+    scenario = summary["scenario"]
+    # Of one training the interval is over the noise alone.
+    kind = "regret_median" if study.is_trained_once(case, scenario) else "regret_wide"
+    runs = study.runs_of(case, scenario)
+    worst = runs.iloc[int(np.argmax(runs.J))]
+    return {
+        "regret_shown_low": summary[f"{kind}_low"],
+        "regret_shown_high": summary[f"{kind}_high"],
+        "regret_worst_low": worst.regret_low,
+        "regret_worst_high": worst.regret_high,
+        **columns_of("violations_week", study.violations_per_week(case, scenario)),
+    }
+
+
+def _summary_cells(row: Mapping[str, Any]) -> dict[str, str]:
+    """Texts of a row of the summary, by the keys of `REPORT_COLUMNS`."""
+    cells = {
+        "case": row["case"],
+        "rank": "" if pd.isna(row["rank"]) else str(row["rank"]),
+        "samples": str(row["plant_samples"] or ""),
+        "finished": f"{row['finished']}/{row['runs']}" if row["samples"] else "",
+        "regret": _percent(row, "regret_median", interval="regret_shown"),
+        "worst": _percent(row, "regret_worst"),
+        "iqm": _percent(row, "regret_iqm"),
+        "J": _number(row["J_median"]),
+        "J-worst": _number(row["J_worst"]),
+        "gap": _percent(row, "gap_closed_median", digits=4),
+        "economic": _number(row["economic_cost"]),
+        "violation": f"{row['mean_violation']:.5f}",
+        "violating": f"{100 * row['violating_share']:.2f}",
+        "week": _estimate(row, "violations_week"),
+        "against": row["against"] if isinstance(row["against"], str) else "",
+        "difference": _percent(row, "difference"),
+        "p": "" if np.isnan(row["difference_p"]) else f"{row['difference_p']:.3f}",
+    }
+    # A single run is the worst and the mean of itself.
+    if row["runs"] == 1:
+        for name in ("worst", "iqm", "J-worst"):
+            cells[name] = ""
+    return cells
+
+
+def aggregate_table(study: StudyMeasurements) -> TitledRows:
+    """Regrets over the runs of all scenarios."""
+    header = ("case", "runs", "regret %, IQM [95 %]", "median", "worst")
+    rows = []
+    for row in study.aggregate.to_dict("records"):
+        rows.append(
+            [
+                row["case"],
+                str(row["runs"]),
+                _percent(row, "regret_iqm"),
+                _percent(row, "regret_median"),
+                _percent(row, "regret_worst"),
+            ]
+        )
+    return header, rows
+
+
+def cases_table(study: StudyMeasurements) -> TitledRows:
+    """What each case is."""
+    header = ("case", "algorithm or controller", "samples", "start", "NMPC", "settings")
+    rows = []
+    for case in study.cases.values():
+        settings = [f"{name} = {json.dumps(value)}" for name, value in case["settings"].items()]
+        rows.append(
+            [
+                case["name"],
+                case["target"],
+                str(case["samples"] or ""),
+                case["start"],
+                case["nmpc"],
+                ", ".join(settings),
+            ]
+        )
+    return header, rows
+
+
+def runs_table(study: StudyMeasurements) -> TitledRows:
+    """Every run by itself."""
+    header = ("case", "scenario", "seed", "status", "plant samples", "regret % [95 %]", "J")
+    rows = []
+    for row in study.runs.to_dict("records"):
+        seed = row["training_seed"]
+        rows.append(
+            [
+                row["case"],
+                row["scenario"],
+                "" if pd.isna(seed) else str(seed),
+                row["status"],
+                str(row["plant_samples"] or ""),
+                _percent(row, "regret"),
+                _number(row["J"]),
+            ]
+        )
+    return header, rows
+
+
+def further_tables(study: StudyMeasurements) -> Iterator[TextTable]:
+    """Title, header and rows of the tables that the study asks for beside its summary."""
+    against = {name: case.get("against") for name, case in study.cases.items()}
+    for scenario in study.scenarios_in_operation:
+        result = study.operation_result(scenario)
+        layout = study.operation_layout(scenario)
+        seconds = study.processor_seconds(scenario)
+        yield from operation_tables(result, scenario, layout, against, seconds)
+    if "paper" in study.about["tables"]:
+        yield paper_table(study)
+
+
+def paper_table(study: StudyMeasurements) -> TextTable:
+    """Title, header and rows: gains of each trained case's median run on every scenario.
+
+    The paper's two gains imply J(b)/J(a) = (1 − 0.21)/(1 − 0.15) = 0.93.
+    """
+    trained = [name for name, case in study.cases.items() if case["trained"]]
+    rows = []
+    for scenario, case in product(study.scenarios, trained):
+        indicators = study.indicators.get((scenario, case))
+        naive, tuned = (study.indicators.get((scenario, name)) for name in PAPER)
+        if indicators is None or naive is None or tuned is None:
+            continue
+        gains = _gains_over_baselines(indicators, naive, tuned)
+        rows.append([scenario, case, *gains])
+    title = (
+        "Gains over the baselines: the paper's text states about 21 % over (a) and 15 % over (b)"
+    )
+    header = (
+        "scenario", "case", "J(b)/J(a)", "J, median", "gain over (a) %", "gain over (b) %",
+        "economic over (a) %", "economic over (b) %", "agrees with the paper on",
+    )  # fmt: skip
+    return title, header, rows
+
+
+def _gains_over_baselines(
+    indicators: Mapping[str, Array], naive: Mapping[str, Array], tuned: Mapping[str, Array]
+) -> list[str]:
+    """Cells of the paper's table: what a case's median run gains over (a) and (b).
+
+    Args:
+        indicators: of the case, (R, S) each.
+        naive: indicators of the controller (a), (1, S) each.
+        tuned: indicators of the controller (b), (1, S) each.
+    """
+    cost = indicators["J"].mean(axis=1)
+    by_cost = np.argsort(cost, kind="stable")
+    # Of an even number the lower one of both middle runs.
+    median_run = by_cost[(len(cost) - 1) // 2]
+    ratio = tuned["J"].mean() / naive["J"].mean()
+    cells = [f"{ratio:.3f}", _number(cost[median_run])]
+    agrees = []
+    for name in ("J", "economic_cost"):
+        values = indicators[name][median_run]
+        for letter, baseline, paper in zip("ab", (naive, tuned), PAPER.values(), strict=True):
+            gain = statistics.gain(values, baseline[name][0])
+            cells.append(shown(gain.value, gain.interval, scale=100.0, digits=3))
+            # The paper's gains are in J.
+            if name == "J" and abs(100 * gain.value - paper) <= NEAR:
+                agrees.append(f"({letter})")
+    return [*cells, " and ".join(agrees)]
+
+
+def _percent(row: Mapping[str, Any], name: str, *, interval: str = "", digits: int = 3) -> str:
+    """A share in per cent with its interval, if any; empty if undefined.
+
+    Args:
+        row: of a table.
+        name: column of the share.
+        interval: column of the interval, without `_low` and `_high`; default: the share's.
+        digits: significant ones.
+    """
+    return _estimate(row, name, interval=interval, scale=100.0, digits=digits)
+
+
+def _estimate(
+    row: Mapping[str, Any], name: str, *, interval: str = "", scale: float = 1.0, digits: int = 3
+) -> str:
+    """A number with its interval, if any; empty if undefined; arguments as of `_percent`."""
+    value = float(row[name])
+    if np.isnan(value):
+        return ""
+    columns = interval or name
+    low = float(row.get(f"{columns}_low", np.nan))
+    high = float(row.get(f"{columns}_high", np.nan))
+    ends = None if np.isnan(low) else (low, high)
+    return shown(value, ends, scale, digits)
+
+
+def _number(value: float) -> str:
+    return shown(float(value), digits=6)

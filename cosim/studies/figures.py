@@ -18,7 +18,8 @@ from cosim.core.statistics import regrets
 from cosim.figures import style
 from cosim.figures.style import DASHED, DotRow, EndLabel, LineStyle, palette, shown_case
 from cosim.studies.measurements import StudyMeasurements
-from cosim.studies.operation import OperationLayout, OperationResult
+from cosim.studies.operation_result import OperationResult
+from cosim.studies.operation_tables import OperationLayout
 from cosim.studies.tables import RUN_KEYS
 
 BANDED = 6

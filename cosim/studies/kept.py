@@ -22,12 +22,10 @@ from cosim.figures.states import Policy, density_figure, phase_figure
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.measurement import built
+from cosim.studies.operation import THETA_PREFIX
 from cosim.studies.plan import StudyPlan
 from cosim.studies.report import FOLDER
 from cosim.studies.run import Run, folder_name, read_table
-
-THETA_PREFIX = "theta "
-"""Of the columns of a log that hold θ."""
 
 
 def keep_files(plan: StudyPlan, out: Path) -> None:

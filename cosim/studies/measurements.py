@@ -17,9 +17,10 @@ from cosim.core.files import read_json
 from cosim.core.protocols import Array
 from cosim.core.statistics import Estimate, over_runs, paired_difference, two_way
 from cosim.evaluation import TIMING
-from cosim.studies.operation import WEEK, OperationLayout, OperationResult, operation_result
+from cosim.studies.operation_result import OperationResult, operation_result
+from cosim.studies.operation_tables import WEEK, OperationLayout
 from cosim.studies.plan import BASELINES
-from cosim.studies.ranks import costs_more, shared_ranks
+from cosim.studies.ranks import NO_SEED, costs_more, paired_runs, shared_ranks
 from cosim.studies.run import GREEDY, INDICATORS, read_table
 from cosim.studies.tables import (
     ABOUT,
@@ -323,26 +324,23 @@ class StudyMeasurements:
         # A counterpart may not run on this scenario.
         if best is not None and len(self.indicator(counterpart, scenario)):
             cost, other_cost = self._pairs(case, counterpart, scenario)
-            median, interval, p = paired_difference(cost, other_cost, best)
-            difference = Estimate(median, interval)
+            # Without a training seed in common nothing is known.
+            if cost.size:
+                median, interval, p = paired_difference(cost, other_cost, best)
+                difference = Estimate(median, interval)
         columns = columns_of("difference", difference)
         return {"against": counterpart or None, **columns, "difference_p": p}
 
     def _pairs(self, case: str, other: str, scenario: str) -> tuple[Array, Array]:
         """J (R, S) of two cases over the training seeds that both have; a controller has any."""
-        cost = self.indicator(case, scenario)
-        other_cost = self.indicator(other, scenario)
+        cost = self._cost_by_training_seed(case, scenario)
+        other_cost = self._cost_by_training_seed(other, scenario)
+        return paired_runs(cost, other_cost)
+
+    def _cost_by_training_seed(self, case: str, scenario: str) -> pd.DataFrame:
+        """J of a case's runs, a row for each training seed."""
         seeds = self.runs_of(case, scenario).training_seed
-        other_seeds = self.runs_of(other, scenario).training_seed
-        if seeds.notna().all() and other_seeds.notna().all():
-            # Both are in the order of the training seeds, so that rows of one number are a pair.
-            in_both = seeds.isin(other_seeds).to_numpy()
-            other_in_both = other_seeds.isin(seeds).to_numpy()
-            cost = cost[in_both]
-            other_cost = other_cost[other_in_both]
-        # A controller has one row, which is compared with each run.
-        cost, other_cost = np.broadcast_arrays(cost, other_cost)
-        return cost, other_cost
+        return pd.DataFrame(self.indicator(case, scenario), index=seeds.fillna(NO_SEED))
 
     def _ranks(self, scenario: str, cases: Sequence[str]) -> dict[str, int | None]:
         """Ranks of cases on a scenario, given in the order of their median J."""

@@ -1,11 +1,17 @@
-"""Ranks of cases, shared by those that cannot be told apart."""
+"""Comparisons of cases by pairs of their runs, and ranks, shared where no difference is shown."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
+import numpy as np
+import pandas as pd
+
 from cosim.core.protocols import Array
 from cosim.core.statistics import paired_difference
+
+NO_SEED = -1
+"""Stands for the training seed of a controller, which has none."""
 
 
 def shared_ranks(
@@ -38,6 +44,28 @@ def shared_ranks(
             rank = place
         ranks[case] = rank
     return ranks
+
+
+def paired_runs(cost: pd.DataFrame, other: pd.DataFrame) -> tuple[Array, Array]:
+    """Costs of two cases over the training seeds that both have.
+
+    Args:
+        cost: J, a row for each training seed (`NO_SEED` of a controller), a column for each seed
+            of the noise.
+        other: J' of the case that it is compared with, likewise.
+
+    Returns:
+        J and J', (R, S) each; R is 0 where both are trained and have no seed in common.
+    """
+    has_controller = NO_SEED in cost.index or NO_SEED in other.index
+    if not has_controller:
+        # Both are in the order of the training seeds, so that rows of one number are a pair.
+        seeds = cost.index
+        cost = cost[seeds.isin(other.index)]
+        other = other[other.index.isin(seeds)]
+    # A controller has one row, which is compared with each run.
+    pair = np.broadcast_arrays(cost.to_numpy(), other.to_numpy())
+    return pair[0], pair[1]
 
 
 def costs_more(cost: Array, other: Array, optimum: Array) -> bool:

@@ -17,7 +17,7 @@ from cosim.core.result import TextTable
 from cosim.core.statistics import shown
 from cosim.core.validation import instead
 from cosim.studies.measurements import StudyMeasurements, columns_of
-from cosim.studies.operation import operation_tables
+from cosim.studies.operation_tables import operation_tables
 
 TitledRows = tuple[Sequence[str], list[list[str]]]
 """Header of a table and its rows of texts."""

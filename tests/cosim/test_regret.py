@@ -9,7 +9,7 @@ from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
 from cosim.core import statistics
 from cosim.evaluation import judge
-from cosim.studies import operation
+from cosim.studies.operation_result import operation_result
 
 STEPS, SEEDS = 12, (3, 4)
 
@@ -61,7 +61,7 @@ def test_the_tables_of_operation_take_the_same_regret():
     life = {"violating": 0.0, "dearest": -5.0, "first_change": 1.0, "updates": 1.0}
     life |= {"model_samples": 0.0, "dearer": 0.0, "excess": 1.0}
     lives = pd.DataFrame([greedy.loc[i, ["case", *key, "J"]].to_dict() | life for i in (0, 1)])
-    (row,) = operation.operation_result(lives, greedy, "best").runs.to_dict("records")
+    (row,) = operation_result(lives, greedy, "best").runs.to_dict("records")
     assert row["regret"] == row["life_regret"] == pytest.approx(0.2)
     assert row["dearest"] == pytest.approx(0.5)
     assert row["excess"] == pytest.approx(0.1)

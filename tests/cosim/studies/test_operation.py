@@ -3,15 +3,9 @@ import pandas as pd
 from scipy.signal import lfilter
 
 from cosim import Study, study
-from cosim.studies.operation import (
-    OPERATION_METRICS,
-    SHIFT,
-    OperationLayout,
-    compare_shifts,
-    operation_result,
-    operation_tables,
-    plant_at,
-)
+from cosim.studies.operation import OPERATION_METRICS, SHIFT, compare_shifts, plant_at
+from cosim.studies.operation_result import operation_result
+from cosim.studies.operation_tables import OperationLayout, operation_tables
 from tests.helpers.toy_study import GROW, SCENARIO
 
 

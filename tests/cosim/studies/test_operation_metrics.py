@@ -9,15 +9,9 @@ from controllers.factories import nmpc
 from cosim import FmuPlant, study
 from cosim.core.simulation import spawn_seeds
 from cosim.core.training_options import TrainingOptions
-from cosim.studies.operation import (
-    OPERATION_METRICS,
-    SHIFT,
-    OperationLayout,
-    compare_shifts,
-    operation_metrics,
-    operation_result,
-    operation_tables,
-)
+from cosim.studies.operation import OPERATION_METRICS, SHIFT, compare_shifts, operation_metrics
+from cosim.studies.operation_result import operation_result
+from cosim.studies.operation_tables import OperationLayout, operation_tables
 from learning.training_run import make_run
 from tests.helpers.toy_study import case, document, toy_scenario
 
@@ -211,6 +205,23 @@ def test_what_was_trained_once_has_no_rank_at_the_end_and_what_does_not_differ_s
     )
     assert "median [95 %] (worst)" in title and header[1] == "rank at the end"
     assert {row[0]: row[1] for row in table} == {"once": "", "a": "1", "b": "1"}
+
+
+def test_cases_without_a_training_seed_in_common_are_not_compared():
+    """Whose noise differs: a difference of run by run would be another figure."""
+    seeds = {"a": (1, 2), "b": (3, 4)}
+    costs = {"a": 11.0, "b": 15.0}
+    rows = [("optimal", None, 480, 7, 10.0), ("optimal", None, 480, 8, 10.0)]
+    run = []
+    for name, cost in costs.items():
+        for seed in seeds[name]:
+            rows += [(name, seed, 480, 7, cost), (name, seed, 480, 8, cost + 1.0)]
+            run.append((name, seed, 480, cost, {}))
+    result = operation_result(lives(*run), greedy(*rows), "optimal")
+    assert result.ranks(480) == {"a": 1, "b": 1}
+    tables = operation_tables(result, "paper", OperationLayout(60, [480]), {"a": "b"}, {})
+    *_, (_, _, differences) = tables
+    assert differences == [["a − b", ""]]
 
 
 def in_operation(tmp_path, **settings):

@@ -246,6 +246,19 @@ def test_a_difference_has_the_sign_of_the_case_that_costs_more():
     assert row_of(table, "cheap")["difference"] == pytest.approx(-0.2)
 
 
+def test_cases_without_a_training_seed_in_common_have_no_difference():
+    costs = {"a": [[12.0, 12.0], [13.0, 13.0]], "b": [[11.0, 11.0], [11.5, 11.5]]}
+    study = results(costs, against={"a": "b"})
+    seeds = {0: 10, 1: 11}
+    for frame in (study.state, study.evaluation):
+        is_b = frame.case == "b"
+        frame.loc[is_b, "training_seed"] = frame.training_seed[is_b].map(seeds)
+    row = row_of(study.summary, "a")
+    assert row["against"] == "b"
+    assert np.isnan(row["difference"]) and np.isnan(row["difference_p"])
+    assert printed(study, "a")["difference % [95 %]"] == ""
+
+
 def test_a_diverged_run_counts_as_run_is_the_worst_and_is_not_finished():
     costs = {"a": [[12.0, 12.0], [np.inf, np.inf], [11.0, 11.0]]}
     found = results(costs, status={("a", 1): "diverged: at sample 7"})

@@ -1,0 +1,125 @@
+"""Regrets of runs in operation: of θ at the marks, and of a run's own samples until then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from cosim.core.protocols import Array
+from cosim.core.statistics import regrets, relative
+from cosim.studies.ranks import NO_SEED, costs_more, paired_runs, shared_ranks
+
+CostsByMark = dict[int, pd.DataFrame]
+"""J by mark, a row for each training seed and a column for each seed of the noise, (R, S)."""
+
+
+@dataclass(frozen=True)
+class OperationResult:
+    """Regrets of all runs in operation on one scenario.
+
+    Attributes:
+        greedy: J of the greedy policy by case and mark, (R, S).
+        optimum: J* (S,) on the same noise by mark.
+        runs: a row for each run and mark: `OPERATION_METRICS` with `dearest` as a regret and
+            `excess` as a share of J*; `regret` of the greedy policy; `life_regret` of the whole
+            run.
+    """
+
+    greedy: dict[str, CostsByMark]
+    optimum: dict[int, Array]
+    runs: pd.DataFrame
+
+    def pairs(self, case: str, other: str, mark: int) -> tuple[Array, Array]:
+        """Greedy J of two cases at a mark, over the training seeds that both have.
+
+        Args:
+            case: name of the case.
+            other: name of the one that it is compared with.
+            mark: samples of operation.
+
+        Returns:
+            J of both, (R, S) each.
+        """
+        return paired_runs(self.greedy[case][mark], self.greedy[other][mark])
+
+    def ranks(self, mark: int) -> dict[str, int | None]:
+        """Ranks of the cases by the median greedy J of their θ at a mark; None where unknown."""
+        medians: dict[str, float] = {}
+        trained_once = []
+        for case, costs in self.greedy.items():
+            if mark not in costs:
+                continue
+            mean_costs = costs[mark].mean(axis=1)
+            medians[case] = float(mean_costs.median())
+            if len(mean_costs) == 1:
+                trained_once.append(case)
+
+        def is_worse(case: str, leader: str) -> bool:
+            cost, leader_cost = self.pairs(case, leader, mark)
+            return costs_more(cost, leader_cost, self.optimum[mark])
+
+        by_cost = sorted(medians, key=medians.__getitem__)
+        return shared_ranks(by_cost, trained_once, is_worse)
+
+
+def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> OperationResult:
+    """Regrets of the runs on one scenario; without an optimum, against the best case at the time.
+
+    Args:
+        runs: rows of operation.csv.
+        greedy: rows of greedy.csv.
+        optimum: name of the case whose J is J*; another name if there is none.
+    """
+    costs = _greedy_costs(greedy)
+    optimal_costs = costs.pop(optimum, None)
+    # A run's noise is that of its training seed, for as many samples.
+    same_noise = ["training_seed", "samples"]
+    if optimal_costs is None:
+        marks = runs.samples.unique().tolist()
+        optimal_greedy = {mark: _best_cost(costs.values(), mark) for mark in marks}
+        optimal_run_J = runs.groupby(same_noise).J.min()
+    else:
+        optimal_greedy = {mark: cost.to_numpy()[0] for mark, cost in optimal_costs.items()}
+        optimal_run_J = runs[runs.case == optimum].set_index(same_noise).J
+
+    rows = runs[runs.case != optimum]
+    run_key = ["case", *same_noise]
+    greedy_J = greedy.groupby(run_key).J.mean().rename("greedy_J")
+    rows = rows.merge(optimal_run_J.rename("optimal_J"), on=same_noise, how="left")
+    rows = rows.merge(greedy_J.reset_index(), on=run_key, how="left")
+
+    # The greedy policies of a mark share its noise, the whole runs of a training seed theirs.
+    optimal_greedy_J = {mark: float(cost.mean()) for mark, cost in optimal_greedy.items()}
+    rows["regret"] = regrets(
+        rows.greedy_J.to_numpy(),
+        rows.samples.map(optimal_greedy_J).to_numpy(),
+    )
+    optimal_J = rows.optimal_J.to_numpy()
+    rows["life_regret"] = regrets(rows.J.to_numpy(), optimal_J)
+    rows["dearest"] = regrets(rows.dearest.to_numpy(), optimal_J)
+    rows["excess"] = relative(rows.excess.to_numpy(), optimal_J)
+    return OperationResult(costs, optimal_greedy, rows)
+
+
+def _greedy_costs(greedy: pd.DataFrame) -> dict[str, CostsByMark]:
+    """J by case and mark."""
+    costs: dict[str, CostsByMark] = {}
+    for (case, mark), rows in greedy.groupby(["case", "samples"], sort=False):
+        seeds = rows.training_seed.fillna(NO_SEED)
+        numbered = rows.assign(training_seed=seeds)
+        table = numbered.pivot(index="training_seed", columns="seed", values="J")
+        costs.setdefault(case, {})[int(mark)] = table
+    return costs
+
+
+def _best_cost(cases: Iterable[CostsByMark], mark: int) -> Array:
+    """Greedy J (S,) of the best case at a mark, its mean over the training seeds."""
+    means = []
+    for costs in cases:
+        if mark in costs:
+            means.append(costs[mark].to_numpy().mean(axis=0))
+    best: Array = min(means, key=np.mean)
+    return best

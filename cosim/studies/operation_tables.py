@@ -1,0 +1,227 @@
+"""Tables of a scenario in operation, as texts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from cosim.core.protocols import Array
+from cosim.core.result import TextTable
+from cosim.core.statistics import (
+    Interval,
+    median_over_runs,
+    paired_difference,
+    shown,
+    two_way,
+)
+from cosim.studies.operation import SHIFT
+from cosim.studies.operation_result import OperationResult
+
+HOUR = 3600.0
+"""Seconds of an hour."""
+DAY = 24 * HOUR
+"""Seconds of a day."""
+WEEK = 7 * DAY
+"""Seconds of a week."""
+
+
+@dataclass(frozen=True)
+class OperationLayout:
+    """What the tables and the figure of a scenario in operation show.
+
+    Attributes:
+        sampling_time: of the plant, in s.
+        columns: marks that tables show.
+        drawn: cases that the figure shows; empty: all.
+    """
+
+    sampling_time: float
+    columns: Sequence[int]
+    drawn: Sequence[str] = ()
+
+    @property
+    def times(self) -> list[str]:
+        """The columns as times of operation."""
+        return [duration(mark * self.sampling_time) for mark in self.columns]
+
+
+def duration(seconds: float) -> str:
+    """A time of operation in words of a calendar: `8 h`, `7 d`."""
+    if seconds >= DAY:
+        return f"{seconds / DAY:.3g} d"
+    return f"{seconds / HOUR:.3g} h"
+
+
+def operation_tables(
+    result: OperationResult,
+    scenario: str,
+    layout: OperationLayout,
+    against: Mapping[str, str | None],
+    seconds: Mapping[str, float],
+) -> Iterator[TextTable]:
+    """Title, header and rows of a scenario's tables.
+
+    Args:
+        result: the regrets of all runs.
+        scenario: its name.
+        layout: what the tables show.
+        against: the counterpart of each case, None where it has none.
+        seconds: processor time in s of a case, up to the last column.
+    """
+    marks = layout.columns
+    times = layout.times
+    title = "Greedy regret in % of the final θ of a run that ends then, median [95 %] (worst)"
+    header = ("case", "rank at the end", *times)
+    yield f"{title}: `{scenario}`", header, _greedy_rows(result, marks)
+
+    title = "Regret in % of the run so far, exploration included, median [95 %] (worst)"
+    yield f"{title}: `{scenario}`", ("case", *times), _run_rows(result.runs, marks)
+
+    end = result.runs[result.runs.samples == marks[-1]]
+    title = f"What {times[-1]} of operation took on `{scenario}`, medians"
+    header = (
+        "case", "runs", "first change, samples", "violating % since", "violations a week [95 %]",
+        "dearest 100 samples %", "updates", "model samples", "processor s",
+    )  # fmt: skip
+    yield title, header, _effort_rows(end, seconds, WEEK / layout.sampling_time)
+
+    rows = _shift_rows(end)
+    if rows:
+        title = f"Shifts of {SHIFT} samples dearer than θ as it starts, median (worst)"
+        header = ("case", "runs", "shifts", "largest excess %")
+        yield f"{title}: `{scenario}`", header, rows
+
+    rows = _difference_rows(result, marks, against)
+    if rows:
+        title = "Greedy regret less the counterpart's, percentage points [95 %]"
+        yield f"{title}: `{scenario}`", ("case", *times), rows
+
+
+def _greedy_rows(result: OperationResult, marks: Sequence[int]) -> list[list[str]]:
+    """Rank, and greedy regret with its interval over training seeds and noise, of each case."""
+    ranks = result.ranks(marks[-1])
+    rows = []
+    for group, runs in result.runs.groupby("case", sort=False):
+        case = str(group)
+        rank = ranks.get(case)
+        cells = [case, "" if rank is None else str(rank)]
+        for mark in marks:
+            regret = runs[runs.samples == mark].regret.to_numpy()
+            cost = result.greedy[case][mark].to_numpy()
+            interval = two_way(cost, result.optimum[mark])
+            cells.append(_regret_cell(regret, interval))
+        rows.append(cells)
+    return rows
+
+
+def _run_rows(runs: pd.DataFrame, marks: Sequence[int]) -> list[list[str]]:
+    """Regret of each case's whole runs, with its interval over the runs, each on its own noise."""
+    rows = []
+    for case, case_runs in runs.groupby("case", sort=False):
+        cells = [str(case)]
+        for mark in marks:
+            regret = case_runs[case_runs.samples == mark].life_regret.to_numpy()
+            interval = median_over_runs(regret).interval
+            cells.append(_regret_cell(regret, interval))
+        rows.append(cells)
+    return rows
+
+
+def _regret_cell(regret: Array, interval: Interval) -> str:
+    """Median of the regrets (R,) of the runs in %, its interval, and the worst."""
+    if not len(regret):
+        return ""
+    median = _percent(float(np.median(regret)), interval)
+    worst = _percent(float(regret.max()))
+    return f"{median} ({worst})"
+
+
+def _effort_rows(
+    end: pd.DataFrame, seconds: Mapping[str, float], samples_per_week: float
+) -> list[list[str]]:
+    """What each case's median run took.
+
+    Args:
+        end: rows of the runs at the last mark.
+        seconds: processor time of each case.
+        samples_per_week: of the plant.
+    """
+    rows = []
+    for group, runs in end.groupby("case", sort=False):
+        case = str(group)
+        median = runs.median(numeric_only=True)
+        rows.append(
+            [
+                case,
+                str(len(runs)),
+                _whole(median.first_change),
+                f"{100 * median.violating:.2f}",
+                _violations_cell(runs.violating, samples_per_week),
+                f"{100 * median.dearest:.1f}",
+                _whole(median.updates),
+                _whole(median.model_samples),
+                _whole(seconds.get(case, np.nan)),
+            ]
+        )
+    return rows
+
+
+def _violations_cell(violating: pd.Series[float], samples_per_week: float) -> str:
+    """Violating samples of a week of the median run, with the interval over the runs."""
+    shares = violating.dropna().to_numpy()
+    if not len(shares):
+        return ""
+    estimate = median_over_runs(shares * samples_per_week)
+    return shown(*estimate, digits=3)
+
+
+def _shift_rows(end: pd.DataFrame) -> list[list[str]]:
+    """Shifts with a higher cost, of the cases that have moved θ for at least one."""
+    rows = []
+    for case, runs in end[end.dearer.notna()].groupby("case", sort=False):
+        excess = 100 * runs.excess
+        rows.append(
+            [
+                str(case),
+                str(len(runs)),
+                f"{_whole(runs.dearer.median())} ({_whole(runs.dearer.max())})",
+                f"{excess.median():.2f} ({excess.max():.2f})",
+            ]
+        )
+    return rows
+
+
+def _difference_rows(
+    result: OperationResult, marks: Sequence[int], against: Mapping[str, str | None]
+) -> list[list[str]]:
+    """Regret of a case less that of its counterpart, at each mark."""
+    rows = []
+    for case, other in against.items():
+        if other is None or not result.optimum:
+            continue
+        # Cases that are not in operation have no costs.
+        if not result.greedy.get(case) or not result.greedy.get(other):
+            continue
+        cells = [f"{case} − {other}"]
+        for mark in marks:
+            cost, other_cost = result.pairs(case, other, mark)
+            # Without a training seed in common nothing is known.
+            if not cost.size:
+                cells.append("")
+                continue
+            median, interval, p = paired_difference(cost, other_cost, result.optimum[mark])
+            difference = _percent(median, interval)
+            cells.append(difference if np.isnan(p) else f"{difference}, p {p:.2f}")
+        rows.append(cells)
+    return rows
+
+
+def _percent(share: float, interval: Interval = None) -> str:
+    return shown(share, interval, scale=100.0, digits=3)
+
+
+def _whole(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.0f}"

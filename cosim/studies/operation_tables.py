@@ -26,6 +26,8 @@ DAY = 24 * HOUR
 """Seconds of a day."""
 WEEK = 7 * DAY
 """Seconds of a week."""
+EFFORT_COLUMNS = ["first_change", "violating", "dearest", "updates", "model_samples"]
+"""Columns of operation.csv whose medians say what a run took."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def _effort_rows(
     rows = []
     for group, runs in end.groupby("case", sort=False):
         case = str(group)
-        median = runs.median(numeric_only=True)
+        median = runs[EFFORT_COLUMNS].median()
         rows.append(
             [
                 case,

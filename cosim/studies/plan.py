@@ -28,9 +28,15 @@ from cosim.workers import Conditions
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 
-BASELINES, NAIVE = "baselines", "naive"
-TRAJECTORIES, LOGS, THETA = "trajectories", "logs", "parameters"
-"""Folders of what a study keeps of its runs."""
+BASELINES = "baselines"
+"""Group of the cases that figures show as lines to compare with."""
+NAIVE = "naive"
+TRAJECTORIES = "trajectories"
+"""Folder of the trajectories that a study keeps of its runs."""
+LOGS = "logs"
+"""Folder of the logs that it keeps."""
+THETA = "parameters"
+"""Folder of the θ files that it keeps."""
 MOST_BETWEEN_ROWS = 500
 """Samples between two rows of a log, at most."""
 BETWEEN_CHECKPOINTS = 5000
@@ -81,7 +87,8 @@ class Study:
     """
 
     def __init__(self, table: StudyTable, folder: Path, file: str | None = None) -> None:
-        self.table, self.file = table, file
+        self.table = table
+        self.file = file
         self.folder = folder.resolve()
         import_from(self.folder)
 
@@ -103,11 +110,13 @@ class Study:
     @property
     def depends_on(self) -> dict[str, str]:
         """Paths of the data files that its plug-ins read, by name; StudyError if one is missing."""
-        paths = {f"file {name}": self.folder / name for name in self.table.depends_on}
-        for path in paths.values():
+        paths = {}
+        for name in self.table.depends_on:
+            path = self.folder / name
             if not path.is_file():
                 raise StudyError(f"depends_on: there is no file '{path}'")
-        return {name: str(path) for name, path in paths.items()}
+            paths[f"file {name}"] = str(path)
+        return paths
 
     @cached_property
     def scenarios(self) -> dict[str, Scenario]:
@@ -138,23 +147,21 @@ class Study:
         for name in names:
             if names.count(name) > 1:
                 raise StudyError(f"two cases are called '{name}'; give each another name")
-        training_seeds: set[int] = set()
-        for case in cases:
-            training_seeds.update(case.training_seeds)
-        for scenario in self.scenarios:
-            evaluation_seeds = set(self.noise(scenario).seeds)
-            self._check_unmet(evaluation_seeds & training_seeds, "a training seed")
-            if self.has_curves:
-                held_out = set(self.held_out(scenario).seeds)
-                self._check_unmet(evaluation_seeds & held_out, "a seed of the curves")
+        self._check_seeds(_training_seeds(cases))
         return cases
 
-    def _check_unmet(self, common: set[int], kind: str) -> None:
+    def _check_seeds(self, training_seeds: Iterable[int]) -> None:
         """Refuse noise that is evaluated on and met elsewhere, too; raises StudyError."""
-        if common:
-            raise StudyError(
-                f"evaluation: noise seed {min(common)} is {kind} too; choose another first_seed"
-            )
+        for scenario in self.scenarios:
+            met = dict.fromkeys(training_seeds, "a training seed")
+            if self.has_curves:
+                met |= dict.fromkeys(self.held_out(scenario).seeds, "a seed of the curves")
+            for seed in self.noise(scenario).seeds:
+                if seed in met:
+                    raise StudyError(
+                        f"evaluation: noise seed {seed} is {met[seed]} too; choose another "
+                        "first_seed"
+                    )
 
     def _scenarios_of(self, table: CaseTable) -> tuple[str, ...]:
         scenarios = tuple(self.scenarios if table.scenarios is None else table.scenarios)
@@ -163,30 +170,27 @@ class Study:
 
     def _controllers(self, table: CaseTable) -> Iterator[Case]:
         """The cases of a table with one controller or several."""
-        scenarios = self._scenarios_of(table)
         sources = table.controller or ""
         if not isinstance(sources, list):
             sources = [sources]
         for source in sources:
             name = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
-            if table.name:
-                name = f"{table.name}({name})" if len(sources) > 1 else table.name
-            group = table.group or BASELINES
-            yield Case(name, scenarios, group, controller=source, against=table.against)
+            if table.name and len(sources) > 1:
+                name = f"{table.name}({name})"
+            elif table.name:
+                name = table.name
+            yield Case(
+                name=name,
+                scenarios=self._scenarios_of(table),
+                group=table.group or BASELINES,
+                controller=source,
+                against=table.against,
+            )
 
     def _grid(self, table: CaseTable) -> Iterator[Case]:
         """The points of the grid of a table with an algorithm."""
         assert table.algorithm is not None
-        scenarios = self._scenarios_of(table)
-        axes: dict[str, list[Any]] = {}
-        for name in GRID_FIELDS:
-            value = getattr(table, name)
-            axes[name] = value if isinstance(value, list) else [value]
-        for name, value in table.settings.items():
-            axes[name] = _axis(table.algorithm, name, value)
-        for name, values in axes.items():
-            if not values:
-                raise StudyError(f"case '{table.name}': the grid of {name} is empty")
+        axes = _axes(table)
         varied = [name for name, values in axes.items() if len(values) > 1]
         seeds = table.training_seeds or self.table.training_seeds
         for coordinates in product(*axes.values()):
@@ -194,12 +198,13 @@ class Study:
             label = " ".join(f"{name}={_text(point[name])}" for name in varied)
             yield Case(
                 name=f"{table.name}({label})" if label else str(table.name),
-                scenarios=scenarios,
+                scenarios=self._scenarios_of(table),
                 group=table.group or table.algorithm.rpartition(":")[2],
                 algorithm=table.algorithm,
                 samples=point.pop("samples"),
                 start=point.pop("start"),
                 nmpc=point.pop("nmpc"),
+                # The other axes are those of the settings.
                 settings=point,
                 training=dict(table.training),
                 training_seeds=tuple(range(seeds.first, seeds.first + seeds.count)),
@@ -240,17 +245,22 @@ class Study:
     @cached_property
     def references(self) -> list[Case]:
         """Controllers for regret and gap that the study lacks: naive, optimal."""
-        there = {case.controller for case in self.cases}
-        wanted: dict[str, list[str]] = {}
+        scenarios_by_controller: dict[str, list[str]] = {}
         for name, scenario in self.scenarios.items():
-            if NAIVE not in there and scenario.controller.model is not None:
-                wanted.setdefault(NAIVE, []).append(name)
-            if name in self.optima and self.optima[name] not in there:
-                wanted.setdefault(self.optima[name], []).append(name)
-        return [
-            Case(name, tuple(scenarios), BASELINES, controller=name)
-            for name, scenarios in wanted.items()
-        ]
+            references = []
+            # Without a model there is no NMPC.
+            if scenario.controller.model is not None:
+                references.append(NAIVE)
+            if name in self.optima:
+                references.append(self.optima[name])
+            for reference in references:
+                scenarios_by_controller.setdefault(reference, []).append(name)
+        for case in self.cases:
+            scenarios_by_controller.pop(case.controller or "", None)
+        cases = []
+        for controller, scenarios in scenarios_by_controller.items():
+            cases.append(Case(controller, tuple(scenarios), BASELINES, controller=controller))
+        return cases
 
     @property
     def all_cases(self) -> list[Case]:
@@ -259,20 +269,26 @@ class Study:
 
     def named(self, controller: str) -> str:
         """A controller's name in the tables: the one that the study gives, else its own."""
-        return next((c.name for c in self.cases if c.controller == controller), controller)
+        for case in self.cases:
+            if case.controller == controller:
+                return case.name
+        return controller
 
     def noise(self, scenario: str) -> Noise:
         """Noise on which the cases of a scenario are compared."""
         table = self.table.evaluation
-        count = self._of(table.seeds, scenario, "evaluation.seeds")
-        seeds = tuple(range(table.first_seed, table.first_seed + count))
-        return Noise(seeds, self._of(table.steps, scenario, "evaluation.steps"), table.burn_in)
+        count = self._value_for(scenario, table.seeds, "evaluation.seeds")
+        steps = self._value_for(scenario, table.steps, "evaluation.steps")
+        seeds = range(table.first_seed, table.first_seed + count)
+        return Noise(tuple(seeds), steps, table.burn_in)
 
     def held_out(self, scenario: str) -> Noise:
         """Noise of the greedy evaluations during training."""
-        count = self._of(self.table.curves.seeds, scenario, "curves.seeds")
-        steps = self._of(self.table.curves.steps, scenario, "curves.steps")
-        return Noise(tuple(range(HELD_OUT, HELD_OUT + count)), steps)
+        table = self.table.curves
+        count = self._value_for(scenario, table.seeds, "curves.seeds")
+        steps = self._value_for(scenario, table.steps, "curves.steps")
+        seeds = range(HELD_OUT, HELD_OUT + count)
+        return Noise(tuple(seeds), steps)
 
     @property
     def has_curves(self) -> bool:
@@ -290,21 +306,26 @@ class Study:
         """Samples of operation at which a scenario's runs are evaluated; else empty."""
         if self.table.operation is None:
             return ()
-        hours = self._of(self.table.operation.hours, scenario, "operation.hours")
+        hours = self._value_for(scenario, self.table.operation.hours, "operation.hours")
         return self.samples_of(hours, scenario)
 
     def samples_of(self, hours: Sequence[float], scenario: str) -> tuple[int, ...]:
         """Hours of operation as samples, increasing."""
-        h = self.scenarios[scenario].sampling_time
-        samples = sorted({max(1, round(3600.0 * hour / h)) for hour in hours})
-        if samples and samples[-1] > MOST_SAMPLES:
+        sampling_time = self.scenarios[scenario].sampling_time
+        # Unlike hours may be one sample.
+        samples = set()
+        for hour in hours:
+            samples.add(max(1, round(3600.0 * hour / sampling_time)))
+        longest = max(samples, default=0)
+        if longest > MOST_SAMPLES:
             raise StudyError(
-                f"operation.hours: {max(hours):g} h are {samples[-1]} samples of '{scenario}'; a "
-                f"run has at most {MOST_SAMPLES}"
+                f"operation.hours: {max(hours):g} h are {longest} samples of '{scenario}'; a run "
+                f"has at most {MOST_SAMPLES}"
             )
-        return tuple(samples)
+        return tuple(sorted(samples))
 
-    def _of(self, value: Choice | dict[str, Choice], scenario: str, field: str) -> Choice:
+    def _value_for(self, scenario: str, value: Choice | dict[str, Choice], field: str) -> Choice:
+        """What a field of the study says for a scenario, itself or as the default."""
         if not isinstance(value, dict):
             return value
         _check_known(value, [*self.scenarios, DEFAULT], field, "scenario")
@@ -326,20 +347,14 @@ class Study:
             ConfigurationError: the algorithm has no place in the study, or an option is none.
         """
         assert case.algorithm is not None
-        marks = self.marks(scenario)
-        samples = case.samples
-        if marks:
-            samples = marks[-1]
-            requires = load_algorithm(case.algorithm).requires
-            if requires != "operation":
-                raise ConfigurationError(
-                    f"case '{case.name}': '{case.algorithm}' requires a {requires}, and a study in "
-                    "operation has none"
-                )
         for name in GIVEN_BY_STUDY:
             if name in case.training:
                 raise ConfigurationError(f"training: {name} is given by the study itself")
         _check_known(case.training, OPTION_NAMES, "training", "option")
+        marks = self.marks(scenario)
+        if marks:
+            _check_learns_in_operation(case)
+        samples = marks[-1] if marks else case.samples
         options = TrainingOptions(
             seed=seed,
             start=self.located(case.start),
@@ -358,16 +373,37 @@ class Study:
     def _intervals(self, samples: int, scenario: str) -> dict[str, int]:
         """Options of a training that has the study's number of greedy evaluations."""
         curves = self.held_out(scenario)
-        between = max(1, samples // self.table.curves.points)
-        rows = -(-between // MOST_BETWEEN_ROWS)
-        log_every = max(1, between // rows)
+        between_points = max(1, samples // self.table.curves.points)
+        # Rows of the log up to a greedy evaluation, evenly.
+        n_rows = -(-between_points // MOST_BETWEEN_ROWS)
+        log_every = max(1, between_points // n_rows)
+        rows_between_checkpoints = max(1, round(BETWEEN_CHECKPOINTS / log_every))
         return {
             "log_every": log_every,
-            "evaluate_every": rows * log_every,
-            "checkpoint_every": log_every * max(1, round(BETWEEN_CHECKPOINTS / log_every)),
+            "evaluate_every": log_every * n_rows,
+            "checkpoint_every": log_every * rows_between_checkpoints,
             "evaluation_seeds": len(curves.seeds),
             "evaluation_steps": curves.steps,
         }
+
+
+def _training_seeds(cases: Iterable[Case]) -> list[int]:
+    """Seeds of the trainings of cases, each once, increasing."""
+    seeds: set[int] = set()
+    for case in cases:
+        seeds.update(case.training_seeds)
+    return sorted(seeds)
+
+
+def _check_learns_in_operation(case: Case) -> None:
+    """Refuse an algorithm that requires more of a plant than operation; raises what it is."""
+    algorithm = str(case.algorithm)
+    requires = load_algorithm(algorithm).requires
+    if requires != "operation":
+        raise ConfigurationError(
+            f"case '{case.name}': '{algorithm}' requires a {requires}, and a study in operation "
+            "has none"
+        )
 
 
 @dataclass(frozen=True)
@@ -396,21 +432,17 @@ def plan(study: Study) -> StudyPlan:
     for name, scenario in study.scenarios.items():
         with FmuPlant(scenario) as plant:
             plants[name] = {"scenario": scenario.hash, "fmu": plant.fmu_sha256}
-    # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
-    training_seeds: set[int] = set()
-    for case in study.cases:
-        training_seeds.update(case.training_seeds)
-    content: dict[tuple[str, str], _Content] = {}
+    cases_on_scenarios = []
+    for name, case in product(study.scenarios, study.all_cases):
+        if name in case.scenarios:
+            cases_on_scenarios.append(_CaseOnScenario.read(study, case, name))
+    _check_case_names(study)
     runs = []
-    for seed, name, case in product(
-        (None, *sorted(training_seeds)), study.scenarios, study.all_cases
-    ):
-        if seed not in (case.training_seeds or (None,)) or name not in case.scenarios:
-            continue
-        if (case.name, name) not in content:
-            content[case.name, name] = _read_content(study, case, name)
-        runs.append(_run(study, case, name, seed, content[case.name, name]))
-    _check_unique_names(study)
+    # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
+    for seed in (None, *_training_seeds(study.cases)):
+        for case_on_scenario in cases_on_scenarios:
+            if seed in (case_on_scenario.case.training_seeds or (None,)):
+                runs.append(case_on_scenario.run(seed))
     provenance = {
         "versions": versions(),
         "code_hash": code_hash(),
@@ -421,129 +453,138 @@ def plan(study: Study) -> StudyPlan:
 
 
 @dataclass(frozen=True)
-class _Content:
-    """What the runs of a case on a scenario have in common, as it was read.
+class _CaseOnScenario:
+    """A case on a scenario, with what its runs have in common.
 
     Attributes:
+        study: the study.
+        case: one of its cases.
+        name: of the scenario.
         conditions: the scenario, and what workers must find.
         controller: the controller, or the start of a training.
-        theta: text of its θ file; None where it is no file.
     """
 
+    study: Study
+    case: Case
+    name: str
     conditions: Conditions
     controller: ControllerSource
-    theta: str | None
+
+    @classmethod
+    def read(cls, study: Study, case: Case, name: str) -> Self:
+        """Read what a case needs; raises what a wrong case would raise in its run.
+
+        Args:
+            study: the study.
+            case: one of its cases.
+            name: of the scenario.
+        """
+        scenario = study.scenarios[name]
+        controller = ControllerSource.read(study.located(case.controller or case.start))
+        if case.algorithm is not None:
+            training = study.training(case, name, seed=0, theta=controller.theta)
+            training.make_run(scenario)
+        elif ":" in (case.controller or ""):
+            # Code of others may fail only when it is called.
+            controller.build(scenario)
+        conditions = Conditions.of_now(scenario, case.target, files=study.depends_on)
+        return cls(study, case, name, conditions, controller)
+
+    def run(self, seed: int | None) -> Run:
+        """The run with a training seed; None of a controller."""
+        study = self.study
+        is_optimum = self.case.name == study.optima.get(self.name)
+        marks = study.marks(self.name) if seed is not None or is_optimum else ()
+        files_at_marks = {f"greedy-{mark}.csv": mark for mark in marks}
+        noise = self._noise(seed, files_at_marks)
+        facts: dict[str, Any] = {**self.conditions.facts, "functions": functions_for(noise)}
+        theta = self.controller.theta
+        if theta is not None:
+            theta_file = Path(self.controller.name).name
+            facts[theta_file] = hashlib.sha256(theta.encode()).hexdigest()
+        training = None
+        if seed is None:
+            facts["controller"] = self.case.controller
+        else:
+            training = study.training(self.case, self.name, seed, theta)
+            # As the file says, so that results depend on no folder.
+            facts["training"] = training.facts(self.case.start)
+        return Run(
+            conditions=self.conditions,
+            case=self.case.name,
+            facts=facts,
+            noise=noise,
+            controller=self.controller if training is None else None,
+            seed=seed,
+            training=training,
+            kept=self._kept(seed),
+            marks=files_at_marks,
+        )
+
+    def _noise(self, seed: int | None, files_at_marks: Mapping[str, int]) -> dict[str, Noise]:
+        """Noise of a run's evaluations by file.
+
+        Args:
+            seed: its training seed; None of a controller.
+            files_at_marks: samples of operation after which its policy is evaluated, by file.
+        """
+        study = self.study
+        noise = {EVALUATION: study.noise(self.name)}
+        cases_here = [case for case in study.cases if self.name in case.scenarios]
+        is_trained_here = any(case.algorithm for case in cases_here)
+        if seed is None and study.has_curves and is_trained_here:
+            # A level for the learning curves.
+            noise[GREEDY] = study.held_out(self.name)
+        for file in files_at_marks:
+            noise[file] = study.noise_at_marks(self.name)
+        for table in self._trajectories(seed):
+            noise[table.file] = Noise((table.seed,), table.steps, whole=True)
+        training_seeds = tuple(_training_seeds(cases_here))
+        if seed is None and training_seeds:
+            # The optimum, on the noise of the trainings.
+            for mark in files_at_marks.values():
+                noise[f"online-{mark}.csv"] = Noise(training_seeds, mark)
+        return noise
+
+    def _is_kept(self, seed: int | None) -> bool:
+        """Whether a run is the one of its case whose files are kept."""
+        first_training_seed = self.case.training_seeds[:1]
+        return seed in (None, *first_training_seed)
+
+    def _trajectories(self, seed: int | None) -> list[TrajectoryTable]:
+        """The trajectories that a run is asked for."""
+        if not self._is_kept(seed):
+            return []
+        wanted = []
+        for table in self.study.table.trajectory:
+            has_case = not table.cases or self.case.name in table.cases
+            has_scenario = not table.scenarios or self.name in table.scenarios
+            if has_case and has_scenario:
+                wanted.append(table)
+        return wanted
+
+    def _kept(self, seed: int | None) -> dict[str, str]:
+        """Where the study keeps a copy of a run's files, by file."""
+        scenario = folder_name(self.name)
+        case = folder_name(self.case.name)
+        kept = {}
+        for table in self._trajectories(seed):
+            kept[table.file] = f"{TRAJECTORIES}/{table.name}/{scenario}/{case}.csv"
+        if self._is_kept(seed) and self.case.name in self.study.table.logs:
+            kept[LOG] = f"{LOGS}/{scenario}-{case}.csv"
+            kept[PARAMETERS] = f"{THETA}/{scenario}-{case}.toml"
+        return kept
 
 
-def _read_content(study: Study, case: Case, name: str) -> _Content:
-    """Read what a case needs; raises what a wrong case would raise in its run."""
-    scenario = study.scenarios[name]
-    controller = ControllerSource.read(study.located(case.controller or case.start))
-    if case.algorithm is not None:
-        study.training(case, name, 0, controller.theta).make_run(scenario)
-    elif ":" in (case.controller or ""):
-        controller.build(scenario)
-    conditions = Conditions.of_now(scenario, case.target, files=study.depends_on)
-    return _Content(conditions, controller, controller.theta)
-
-
-def _run(study: Study, case: Case, name: str, seed: int | None, content: _Content) -> Run:
-    """A case's run on a scenario."""
-    trained = seed is not None
-    is_optimum = case.name == study.optima.get(name)
-    marks = study.marks(name) if trained or is_optimum else ()
-    noise, at_marks = _noise(study, case, name, seed, marks)
-    facts: dict[str, Any] = {**content.conditions.facts, "functions": functions_for(noise)}
-    if content.theta is not None:
-        text = content.theta.encode()
-        facts[Path(content.controller.name).name] = hashlib.sha256(text).hexdigest()
-    training = None
-    if seed is None:
-        facts["controller"] = case.controller
-    else:  # as the file says, so that results depend on no folder
-        training = study.training(case, name, seed, content.theta)
-        facts["training"] = training.facts(case.start)
-    return Run(
-        conditions=content.conditions,
-        case=case.name,
-        facts=facts,
-        noise=noise,
-        controller=content.controller if training is None else None,
-        seed=seed,
-        training=training,
-        kept=_kept(study, case, name, seed),
-        marks=at_marks,
-    )
-
-
-def _noise(
-    study: Study, case: Case, name: str, seed: int | None, marks: Iterable[int]
-) -> tuple[dict[str, Noise], dict[str, int]]:
-    """Noise of a run's evaluations by file, and the mark of operation of those that have one.
-
-    Args:
-        study: the study.
-        case: of the run.
-        name: of its scenario.
-        seed: its training seed; None of a controller.
-        marks: samples of operation after which its policy is evaluated.
-    """
-    noise = {EVALUATION: study.noise(name)}
-    cases = [other for other in study.cases if name in other.scenarios]
-    if seed is None and study.has_curves and any(other.algorithm for other in cases):
-        # A level for the learning curves.
-        noise[GREEDY] = study.held_out(name)
-    at_marks = {f"greedy-{mark}.csv": mark for mark in marks}
-    for file in at_marks:
-        noise[file] = study.noise_at_marks(name)
-    for table in _trajectories(study, case, name, seed):
-        noise[table.file] = Noise((table.seed,), table.steps, whole=True)
-    training_seeds: set[int] = set()
-    for other in cases:
-        training_seeds.update(other.training_seeds)
-    if seed is None and training_seeds:
-        # The optimum, on the noise of the trainings.
-        for mark in marks:
-            noise[f"online-{mark}.csv"] = Noise(tuple(sorted(training_seeds)), mark)
-    return noise, at_marks
-
-
-def _is_first(case: Case, seed: int | None) -> bool:
-    """Whether a run is the one of its case whose files are kept."""
-    return seed in (None, *case.training_seeds[:1])
-
-
-def _trajectories(
-    study: Study, case: Case, name: str, seed: int | None
-) -> Iterator[TrajectoryTable]:
-    """The trajectories that a run is asked for."""
-    for table in study.table.trajectory:
-        wanted = case.name in (table.cases or [case.name])
-        if wanted and name in (table.scenarios or [name]) and _is_first(case, seed):
-            yield table
-
-
-def _kept(study: Study, case: Case, name: str, seed: int | None) -> dict[str, str]:
-    """Where the study keeps a copy of a run's files, by file."""
-    where, stem = folder_name(name), folder_name(case.name)
-    kept = {}
-    for table in _trajectories(study, case, name, seed):
-        kept[table.file] = f"{TRAJECTORIES}/{table.name}/{where}/{stem}.csv"
-    if _is_first(case, seed) and case.name in study.table.logs:
-        kept[LOG] = f"{LOGS}/{where}-{stem}.csv"
-        kept[PARAMETERS] = f"{THETA}/{where}-{stem}.toml"
-    return kept
-
-
-def _check_unique_names(study: Study) -> None:
+def _check_case_names(study: Study) -> None:
     """Raise StudyError where a table names a case that is none."""
     names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]
     for table in study.table.trajectory:
         _check_known(table.cases or (), names, f"trajectory '{table.name}'", "case")
     _check_known(study.table.logs, trained, "logs", "case")
-    if (operation := study.table.operation) is not None:
-        _check_known(operation.drawn, trained, "operation.drawn", "case")
+    if study.table.operation is not None:
+        _check_known(study.table.operation.drawn, trained, "operation.drawn", "case")
     for case in study.cases:
         study.counterpart(case)
 
@@ -562,23 +603,43 @@ def _check_known(words: Iterable[str], known: Iterable[str], where: str, kind: s
             raise StudyError(f"{where}: there is no {kind} '{word}'{instead(word, known)}")
 
 
-def _is_sequence(annotation: Any) -> bool:
-    """Whether a field of this type takes a list, as one of its alternatives too."""
-    if get_origin(annotation) in SEQUENCES or annotation in SEQUENCES:
-        return True
-    return any(_is_sequence(part) for part in get_args(annotation) if part is not Ellipsis)
+def _axes(table: CaseTable) -> dict[str, list[Any]]:
+    """Values of each field and setting that a case's grid runs over; raises StudyError."""
+    axes = {}
+    for name in GRID_FIELDS:
+        value = getattr(table, name)
+        axes[name] = value if isinstance(value, list) else [value]
+    for name, value in table.settings.items():
+        axes[name] = _values_of_setting(str(table.algorithm), name, value)
+    for name, values in axes.items():
+        if not values:
+            raise StudyError(f"case '{table.name}': the grid of {name} is empty")
+    return axes
 
 
-def _axis(algorithm: str, setting: str, value: Any) -> list[Any]:
+def _values_of_setting(algorithm: str, setting: str, value: Any) -> list[Any]:
     """Values of a setting: a list is a grid, but for a setting that is a list itself."""
     if not isinstance(value, list):
         return [value]
+    is_list_of_lists = bool(value) and all(isinstance(item, list) for item in value)
     field = load_algorithm(algorithm).Configuration.model_fields.get(setting)
-    nested = bool(value) and all(isinstance(item, list) for item in value)
-    takes_a_list = field is not None and _is_sequence(field.annotation)
-    return [value] if takes_a_list and not nested else value
+    takes_list = field is not None and _is_sequence(field.annotation)
+    if takes_list and not is_list_of_lists:
+        return [value]
+    return value
+
+
+def _is_sequence(annotation: Any) -> bool:
+    """Whether a field of this type takes a list, as one of its alternatives too."""
+    if annotation in SEQUENCES or get_origin(annotation) in SEQUENCES:
+        return True
+    # `tuple[int, ...]` has an ellipsis, which is no type.
+    alternatives = [part for part in get_args(annotation) if part is not Ellipsis]
+    return any(_is_sequence(part) for part in alternatives)
 
 
 def _text(value: Any) -> str:
     """A value of a grid as it stands in the name of its case."""
-    return Path(value).stem if isinstance(value, str) else json.dumps(value).replace(" ", "")
+    if isinstance(value, str):
+        return Path(value).stem
+    return json.dumps(value).replace(" ", "")

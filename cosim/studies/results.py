@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import product
@@ -26,7 +26,13 @@ from cosim.studies.kept import draw_kept, keep_files
 from cosim.studies.measurements import StudyMeasurements
 from cosim.studies.plan import Study, StudyPlan, plan
 from cosim.studies.report import FOLDER, write_report
-from cosim.studies.report_tables import SHORT_COLUMNS, TitledRows, paper_table, scenario_table
+from cosim.studies.report_tables import (
+    SHORT_COLUMNS,
+    TitledRows,
+    further_tables,
+    paper_table,
+    scenario_table,
+)
 from cosim.studies.run import GREEDY, Runner, RunStore, folder_name, frame_csv
 from cosim.studies.tables import (
     ABOUT,
@@ -100,6 +106,10 @@ class StudyResults(StudyMeasurements, Shown):
         if scenario is not None:
             return markdown_table(*self.lines(scenario))
         return "\n".join(f"{name}\n\n{self.table(name)}" for name in self.scenarios)
+
+    def further_tables(self) -> Iterator[TextTable]:
+        """Title, header and rows of the tables that the study asks for beside its summary."""
+        return further_tables(self)
 
     def paper(self) -> TextTable:
         """Title, header and rows: gains over the paper's two baselines, of each trained case."""

@@ -47,6 +47,7 @@ from controllers.sensitivities import (
     curvature_directions,
     sensitivities,
 )
+from controllers.stabilised import Stages, solve_stabilised
 from controllers.stage_symbols import nominal_given
 from controllers.theta import Parameters
 from cosim.core.protocols import CompiledLoop, Matrix, Vector
@@ -448,6 +449,24 @@ INACCURATE = "inaccurate"
 """Status of the QpError of a QP whose solution is not accurate enough to be used."""
 ACCURATE_RESIDUAL = 1e-9
 """KKT residual above which a solution is polished."""
+GROWTH_LIMIT = 100.0
+"""Growth over the horizon above which the QP is not condensed.
+
+It is that at the reference; where a closed loop goes it may be a thousand times as large, and the
+condensed QP then loses all digits.
+"""
+
+
+def growth_over_horizon(problem: Problem) -> float:
+    """Growth of the fastest mode of the nominal model at its reference over the horizon, ρ(A)ᴺ.
+
+    The condensed Hessian has the square of this in its condition number.
+    """
+    from controllers.economic import linear_model  # noqa: PLC0415 - SciPy
+
+    A, _ = linear_model(problem)
+    radius = np.abs(np.linalg.eigvals(A)).max()
+    return float(radius**problem.horizon)
 
 
 class Engine:
@@ -503,14 +522,16 @@ class Engine:
         Args:
             functions: The controller's functions, in whose memory the engine works.
             stagewise: Whether the QP is solved stage by stage. None leaves it to a rule: one of
-                many stages is, and one too large for an exported controller.
+                many stages is, one too large for an exported controller, and one of a model that
+                is so unstable that the condensed QP loses its digits.
         """
         if stagewise is None:
             problem = functions.problem
             width = problem.n_states + problem.n_actions
             # A rule of thumb: where this becomes faster depends on the plant and on θ.
             long = problem.horizon >= 5 * width
-            stagewise = long or stack_needed(functions) > STACK_LIMIT
+            large = stack_needed(functions) > STACK_LIMIT
+            stagewise = long or large or growth_over_horizon(problem) > GROWTH_LIMIT
         sources = controller_sources(functions, stagewise=stagewise)
         # Beside what is exported, the engine has derivatives and closed loops.
         for name in ("sensitivities.h", "loop.h", "fmu.h", "rti_loop.h", "engine.c"):
@@ -690,7 +711,8 @@ class RtiNmpc:
         problem: The control problem.
         parameters: θ.
         hessian: `gauss-newton` or `exact`.
-        backend: `daqp`, `proxqp`, `qpsolvers:SOLVER`, or a function that makes a `QpBackend`.
+        backend: `daqp`, `proxqp`, `qpsolvers:SOLVER`, or a function that makes a `QpBackend`. What
+            `daqp` leaves unsolved is tried once more in stabilised controls.
         iterations: Number of QPs a feedback.
 
     Raises:
@@ -722,6 +744,7 @@ class RtiNmpc:
         self.iterations = iterations
         self.problem = problem
         self._compilable = hessian == "gauss-newton" and backend == "daqp"
+        self._solves_again = backend == "daqp"
         self._make_backend: Callable[[], QpBackend]
         if isinstance(backend, str):
             self._make_backend = partial(make_backend, backend)
@@ -1120,9 +1143,58 @@ class RtiNmpc:
         # A solver would loop or crash on numbers that are not finite.
         if not self._embed_state(a):
             return False
-        solution = self._backend.solve(self._qp)
-        self._accept(solution, enforced=a is not None)
+        enforced = a is not None
+        try:
+            solution = self._backend.solve(self._qp)
+            self._accept(solution, enforced=enforced)
+        except QpError as error:
+            if not self._solves_again or not self._solve_again(enforced):
+                raise error from None
         return True
+
+    def _solve_again(self, enforced: bool) -> bool:
+        """Solve in stabilised controls what DAQP has left unsolved condensed; whether that is done.
+
+        The condensed QP of an unstable model is convex, but so badly conditioned that DAQP loses
+        its way, and a sample without a solution costs such a plant dearly.
+        """
+        try:
+            solution = solve_stabilised(self._stages(), self._initial_state())
+        except QpError:
+            return False
+        # Not polished: that would take Newton steps on the condensed QP.
+        return self._read(solution, enforced) <= SOLVED_RESIDUAL
+
+    def _stages(self) -> Stages:
+        """The QP as prepared, stage by stage, with the present bounds of the controls."""
+        problem = self.problem
+        horizon = problem.horizon
+        n = problem.n_states
+        width = n + problem.n_actions
+        part = self._prepare.part
+        parameters = self._parameters
+        x_s = problem.reference_state
+        state_scale = problem.scale.state
+        return Stages(
+            A=part("A").reshape(horizon, n, n),
+            B=part("B").reshape(horizon, n, -1),
+            r=part("r").reshape(horizon, n),
+            L=part("L").reshape(horizon, width, width),
+            q=part("q").reshape(horizon, width),
+            L_N=part("L_N").reshape(n, n),
+            q_N=part("q_N"),
+            lower=self._qp.lower,
+            upper=self._qp.upper,
+            state_lower=(parameters["x_l"] - x_s) / state_scale,
+            state_upper=(parameters["x_u"] - x_s) / state_scale,
+            w=self._qp.w,
+            W=self._qp.W,
+        )
+
+    def _initial_state(self) -> Vector:
+        """ξ_0 of the state in the read-out's memory, (n,)."""
+        deviation = self._readout.inputs["s"] - self.problem.reference_state
+        return np.asarray(deviation.reshape(-1) / self.problem.scale.state)
 
     def _embed_state(self, a: Vector | None) -> bool:
         """Put the state, and an action to enforce, into the QP; whether all is finite."""

@@ -153,8 +153,8 @@ CompiledLoop = Callable[[Any, int, Array], tuple[int, int, int]]
 
 It gets an FMU instance's native functions, the number of the first sample, and a table with a row
 for each sample to come: state, action, stage cost, disturbance, value, residual, the controller's
-status (`cosim.core.simulation.STATUSES`), seconds of prepare, feedback and step. It returns the
-sample that it came to, what failed there (0: nothing), and FMI's status.
+status (by its number in `cosim.core.simulation.LOOP_STATUSES`), seconds of prepare, feedback and
+step. It returns the sample that it came to, what failed there (0: nothing), and FMI's status.
 """
 
 

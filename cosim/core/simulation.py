@@ -25,7 +25,7 @@ MEASURED = (
 
 The last two are there with sensors, under which no compiled loop runs.
 """
-STATUSES = ("solved", FALLBACK, "clamped")
+LOOP_STATUSES = ("solved", FALLBACK, "clamped")
 """Statuses by their number in a compiled loop's column `failed`; one is a failure."""
 REFRESH = 0.1
 """Seconds between two drawings of a progress bar, at least."""
@@ -295,8 +295,8 @@ class _Run:
         """Store rows of the compiled loop with their status."""
         position = self._ends[MEASURED.index("failed") - 1]
         for number in table[:, position]:
-            self._status.append(STATUSES[int(number)])
-        table[:, position] = table[:, position] == STATUSES.index(FALLBACK)
+            self._status.append(LOOP_STATUSES[int(number)])
+        table[:, position] = table[:, position] == LOOP_STATUSES.index(FALLBACK)
         self._fill(first, table)
 
     def _fill(self, first: int, table: Array) -> dict[str, Array]:

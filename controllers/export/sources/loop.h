@@ -25,7 +25,7 @@ typedef struct {
     size_t n_outputs;
 } LoopPlant;
 
-/* How a controller came to its action: `cosim.core.simulation.STATUSES` has their names. */
+/* How a controller came to its action: `cosim.core.simulation.LOOP_STATUSES` has their names. */
 enum { LOOP_SOLVED, LOOP_FAILED, LOOP_CLAMPED };
 
 /* What a controller says beside its action. */

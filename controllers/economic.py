@@ -773,21 +773,6 @@ def linearisation_substeps(problem: Problem) -> int:
     )
 
 
-def linear_model(problem: Problem) -> tuple[Array, Array]:
-    """A (n, n) and B (n, m) of the sampled nominal model at the problem's reference."""
-    n = problem.n_states
-    model = problem.model
-    x, u, d, p = model.symbols()
-    f = discretise(model, problem.sampling_time, problem.substeps)
-    x_next = f(x, u, d, p)
-    by_point = ca.jacobian(x_next, ca.vertcat(x, u))
-    jacobian = ca.Function("AB", [x, u, d, p], [by_point])
-    both = jacobian(*problem.nominal_point).full()
-    A = both[:, :n]
-    B = both[:, n:]
-    return A, B
-
-
 def _rounded(block: Array) -> Array:
     """Entries to six digits, 0 below 1e-9 of the largest, without a solver's last bits."""
     # The last bits are the solver's and differ between platforms; θ files must not.

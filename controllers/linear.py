@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from controllers.economic import linear_model, local_feedback, tune
+from controllers.economic import local_feedback, tune
 from controllers.errors import ControllerError
-from controllers.problem import Problem
+from controllers.problem import Problem, linear_model
 from cosim.core.protocols import Array, Decision
 
 

@@ -175,6 +175,21 @@ def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if size > least}
 
 
+def linear_model(problem: Problem) -> tuple[Matrix, Matrix]:
+    """A (n, n) and B (n, m) of the sampled nominal model at the problem's reference."""
+    n = problem.n_states
+    model = problem.model
+    x, u, d, p = model.symbols()
+    f = discretise(model, problem.sampling_time, problem.substeps)
+    x_next = f(x, u, d, p)
+    by_point = ca.jacobian(x_next, ca.vertcat(x, u))
+    jacobian = ca.Function("AB", [x, u, d, p], [by_point])
+    both = jacobian(*problem.nominal_point).full()
+    A = both[:, :n]
+    B = both[:, n:]
+    return A, B
+
+
 def _derivatives_at_reference(problem: Problem) -> tuple[Vector, Vector, Matrix]:
     """∇ℓ (n+m,), the diagonal of ∇²ℓ (n+m,), and ∂x' (n, n+m), by (x, u) at the reference."""
     model = problem.model

@@ -7,10 +7,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from controllers.economic import linear_model
 from controllers.functions import StackedFunction, define
 from controllers.model import discretise
-from controllers.problem import Problem
+from controllers.problem import Problem, linear_model
 from controllers.theta import Parameters
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import Penalty, Scenario

@@ -32,7 +32,7 @@ from controllers.functions import (
     worth_compiling,
 )
 from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions, Spectrum
-from controllers.problem import Problem
+from controllers.problem import Problem, linear_model
 from controllers.qp import (
     QpBackend,
     QpSolution,
@@ -462,8 +462,6 @@ def growth_over_horizon(problem: Problem) -> float:
 
     The condensed Hessian has the square of this in its condition number.
     """
-    from controllers.economic import linear_model  # noqa: PLC0415 - SciPy
-
     A, _ = linear_model(problem)
     radius = np.abs(np.linalg.eigvals(A)).max()
     return float(radius**problem.horizon)
@@ -712,7 +710,7 @@ class RtiNmpc:
         parameters: θ.
         hessian: `gauss-newton` or `exact`.
         backend: `daqp`, `proxqp`, `qpsolvers:SOLVER`, or a function that makes a `QpBackend`. What
-            `daqp` leaves unsolved is tried once more in stabilised controls.
+            `daqp` leaves unsolved of an unstable model is tried once more in stabilised controls.
         iterations: Number of QPs a feedback.
 
     Raises:
@@ -744,7 +742,7 @@ class RtiNmpc:
         self.iterations = iterations
         self.problem = problem
         self._compilable = hessian == "gauss-newton" and backend == "daqp"
-        self._solves_again = backend == "daqp"
+        self._chosen_backend = backend
         self._make_backend: Callable[[], QpBackend]
         if isinstance(backend, str):
             self._make_backend = partial(make_backend, backend)
@@ -1151,6 +1149,16 @@ class RtiNmpc:
             if not self._solves_again or not self._solve_again(enforced):
                 raise error from None
         return True
+
+    @cached_property
+    def _solves_again(self) -> bool:
+        """Whether what the backend leaves unsolved is tried in stabilised controls.
+
+        It is where the compiled controller solves stage by stage for the same reason, so that a
+        stable model's sample fails or not however it is computed.
+        """
+        unstable = growth_over_horizon(self.problem) > GROWTH_LIMIT
+        return self._chosen_backend == "daqp" and unstable
 
     def _solve_again(self, enforced: bool) -> bool:
         """Solve in stabilised controls what DAQP has left unsolved condensed; whether that is done.

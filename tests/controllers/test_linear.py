@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from controllers import ControllerError, Problem
-from controllers.economic import linear_model, tune
+from controllers.economic import tune
 from controllers.linear import Lqr, PiLoops, pairing
+from controllers.problem import linear_model
 from cosim import Scenario
 
 

@@ -180,7 +180,9 @@ def test_its_own_loop_gives_the_bytes_of_pythons(monkeypatch, scenario):
         for _ in range(2):
             seen = []
             run = simulate(plant, controller, 550, 3, progress=seen.append)
-            runs.append((run.to_csv(), run.status, run.final_state.tobytes(), seen, plant.k))
+            runs.append((run.to_csv(), run.status, run.final_state.tobytes(), plant.k))
+            # A slow machine sees more of them.
+            assert {500, 550} <= set(seen)
             monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
     assert runs[0] == runs[1]
     assert set(run.status) == {"solved"}

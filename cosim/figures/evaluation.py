@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter
 
 from cosim.core.protocols import Array
+from cosim.core.statistics import Estimate, regret, regret_terms
 from cosim.core.statistics import mean as mean_of
-from cosim.core.statistics import regret, regret_terms
 from cosim.figures.style import (
     DASHED,
     REFERENCE,
@@ -68,26 +68,34 @@ def _draw_costs(
     for name, costs in controllers.items():
         values = costs.J.to_numpy()
         if optimal is None:
-            scale = 1.0
-            estimate = mean_of(values)
-        else:  # in %
-            scale = 100.0
-            estimate = regret(values, optimal)
-            values = 100 * regret_terms(values, optimal)
-        low, high = estimate.interval or (np.nan, np.nan)
-        finished = np.ones(len(values), dtype=bool)
-        middle = scale * estimate.value
-        rows.append(DotRow(name, values, finished, middle, scale * low, scale * high))
+            rows.append(_row(name, values, mean_of(values)))
+        else:
+            in_percent = 100 * regret_terms(values, optimal)
+            rows.append(_row(name, in_percent, regret(values, optimal), scale=100.0))
     values = dot_rows(axes, rows, styles)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
         regret_axis(axes, "x", np.append(values, 0.0), SEED_FLOOR)
         axes.set_xlabel("regret %, 95 % interval")
         return
-    least, most = float(values.min()), float(values.max())
+    least = float(values.min())
+    most = float(values.max())
     if least > 0 and most > DECADE * least:
         axes.set_xscale("log")
     axes.set_xlabel("J per sample, 95 % interval")
+
+
+def _row(name: str, values: Array, estimate: Estimate, scale: float = 1.0) -> DotRow:
+    """A controller's values (S,) and their mean with its interval, which is multiplied."""
+    low, high = estimate.interval or (np.nan, np.nan)
+    return DotRow(
+        name,
+        values,
+        finished=np.ones(len(values), dtype=bool),
+        middle=scale * estimate.value,
+        low=scale * low,
+        high=scale * high,
+    )
 
 
 def _draw_pareto(
@@ -96,16 +104,32 @@ def _draw_pareto(
     """Economic cost against violation of each controller, and the line of the best of both."""
     means = {}
     for name, costs in controllers.items():
-        means[name] = (float(np.mean(costs.mean_violation)), float(np.mean(costs.economic_cost)))
+        violation = float(np.mean(costs.mean_violation))
+        economic_cost = float(np.mean(costs.economic_cost))
+        means[name] = (violation, economic_cost)
     front = _pareto_front(set(means.values()))
+    # A single controller is better than all others: there is no line to draw.
     if len(front) > 1:
-        text = "no other is better in both"
-        axes.plot(*np.array(front).T, color=REFERENCE, linewidth=0.9, linestyle=DASHED, label=text)
+        violations, economic_costs = zip(*front, strict=True)
+        axes.plot(
+            violations,
+            economic_costs,
+            color=REFERENCE,
+            linewidth=0.9,
+            linestyle=DASHED,
+            label="no other is better in both",
+        )
         axes.legend(loc="best")
     for name, costs in controllers.items():
         color = styles[name].color
         axes.plot(
-            costs.mean_violation, costs.economic_cost, ".", color=color, ms=3, alpha=0.35, mew=0
+            costs.mean_violation,
+            costs.economic_cost,
+            ".",
+            color=color,
+            markersize=3,
+            markeredgewidth=0,
+            alpha=0.35,
         )
         axes.errorbar(
             *means[name],
@@ -130,8 +154,9 @@ def _pareto_front(points: set[tuple[float, float]]) -> list[tuple[float, float]]
     """The points that no other one is below in both coordinates, by the first coordinate."""
     front = []
     for point in sorted(points):
-        beaten = any(np.less_equal(other, point).all() for other in points - {point})
-        if not beaten:
+        others = points - {point}
+        is_beaten = any(np.less_equal(other, point).all() for other in others)
+        if not is_beaten:
             front.append(point)
     return front
 

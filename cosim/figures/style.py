@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import FigureError
 from cosim.core.files import write_atomically
+from cosim.core.protocols import Array
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""
@@ -38,15 +39,28 @@ INK = "#222222"
 END_SIZE = 6.5
 DASHED: Any = (0, (4, 2))
 _KNOWN = {
-    "naive": "#7F7F7F", "tuned": "#E69F00", "converged": "#CC79A7", "optimal": "#111111",
-    "q-learning": "#0072B2", "batch-q-learning": "#009E73", "actor-critic": "#D55E00",
-    "fixed": "#999933", "model-based": "#44AA99", "dyna": "#332288",
-    "offset-free": "#AA4499", "identified": "#117733", "policy-search": "#661100",
-    "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9", "learnt": "#56B4E9",
-}  # fmt: skip
+    "naive": "#7F7F7F",
+    "tuned": "#E69F00",
+    "converged": "#CC79A7",
+    "optimal": "#111111",
+    "q-learning": "#0072B2",
+    "batch-q-learning": "#009E73",
+    "actor-critic": "#D55E00",
+    "fixed": "#999933",
+    "model-based": "#44AA99",
+    "dyna": "#332288",
+    "offset-free": "#AA4499",
+    "identified": "#117733",
+    "policy-search": "#661100",
+    "backoff": "#6699CC",
+    "pi": "#B08D57",
+    "lqr": "#8C8CD9",
+    "learnt": "#56B4E9",
+}
+"""Colours of the rules and controllers that every figure knows."""
 _OTHERS = ("#CC6677", "#A6761D", "#E377C2", "#6D9E1F", "#B04FD0", "#4477AA", "#DDCC77")
 _DASHES: Any = ((4, 1.5), (1, 1.2), (5, 1.5, 1, 1.5), (9, 2), (1, 3), (4, 1, 1, 1, 1, 1))
-_LINES: Any = ("-", *((0, dashes) for dashes in _DASHES))
+_LINES: Any = ["-", *((0, dashes) for dashes in _DASHES)]
 _STYLE = Path(__file__).with_name("house.mplstyle")
 
 
@@ -144,12 +158,13 @@ def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Li
     for rule in rules.values():
         if rule not in colors:
             colors[rule] = _KNOWN.get(rule) or next(others)
-    used: Counter[str] = Counter()
+    n_lines: Counter[str] = Counter()
     styles = {}
     for name, rule in rules.items():
         color = colors[rule]
-        styles[name] = LineStyle(color, _LINES[used[color] % len(_LINES)])
-        used[color] += 1
+        line = _LINES[n_lines[color] % len(_LINES)]
+        styles[name] = LineStyle(color, line)
+        n_lines[color] += 1
     return styles
 
 
@@ -168,7 +183,8 @@ def lighten(color: str) -> str:
     if max(rgb) > 0.55:
         return color
     hue, lightness, saturation = rgb_to_hls(*rgb)
-    return to_hex(hls_to_rgb(hue, max(lightness, 0.85 - lightness), saturation))
+    lighter = max(lightness, 0.85 - lightness)
+    return to_hex(hls_to_rgb(hue, lighter, saturation))
 
 
 def plain(text: str) -> str:
@@ -192,11 +208,14 @@ def symbol(name: str) -> str:
     head, _, subscript = name.partition("_")
     if not head.isalpha() or "$" in name:
         return plain(name)
-    known = {"lambda": r"\lambda", "sigma": r"\sigma", "Vf": r"V^\mathrm{f}"}
+    if not subscript:
+        return f"${head}$"
+    symbols = {"lambda": r"\lambda", "sigma": r"\sigma", "Vf": r"V^\mathrm{f}"}
     # The stage cost's blocks are set with ℓ; x_l is the lower bound.
     if head in ("B", "b"):
-        known["l"] = r"\ell"
-    return f"${head}_{{{known.get(subscript, subscript)}}}$" if subscript else f"${head}$"
+        symbols["l"] = r"\ell"
+    text = symbols.get(subscript, subscript)
+    return f"${head}_{{{text}}}$"
 
 
 def label(name: str, unit: str) -> str:
@@ -211,13 +230,13 @@ def label(name: str, unit: str) -> str:
     text = plain(name.replace("_", " "))
     if digits and head.isalpha():
         text = f"${head}_{{{digits}}}$"
-    shown = plain({"degC": "°C", "1": ""}.get(unit, unit))
-    return f"{text} [{shown}]" if shown else text
+    if unit in ("", "1"):
+        return text
+    shown_unit = "°C" if unit == "degC" else plain(unit)
+    return f"{text} [{shown_unit}]"
 
 
-def regret_axis(
-    axes: Axes, which: Literal["x", "y"], values: NDArray[np.float64], floor: float = FLOOR
-) -> None:
+def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: float = FLOOR) -> None:
     """Scale an axis for regrets: logarithmic above a floor, linear below, J* at zero.
 
     Args:
@@ -229,6 +248,7 @@ def regret_axis(
     finite = values[np.isfinite(values)]
     low = float(finite.min()) if finite.size else 0.0
     high = float(finite.max()) if finite.size else floor
+    # A margin that is a factor; on the linear part, where J* is, a share of it.
     first = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
     last = 1.6 * max(high, floor)
     if which == "x":
@@ -245,16 +265,14 @@ class DotRow(NamedTuple):
     """Values of a case (K,), whether each finished, and a middle with its interval."""
 
     case: str
-    values: NDArray[np.float64]
+    values: Array
     finished: NDArray[np.bool_]
     middle: float
     low: float = np.nan
     high: float = np.nan
 
 
-def dot_rows(
-    axes: Axes, rows: Sequence[DotRow], styles: Mapping[str, LineStyle]
-) -> NDArray[np.float64]:
+def dot_rows(axes: Axes, rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Array:
     """Draw a row for each case: its values, crosses where one diverged, their middle, its interval.
 
     Args:
@@ -266,30 +284,36 @@ def dot_rows(
         The values of all rows, one after the other.
     """
     for position, row in enumerate(rows):
-        color = styles[row.case].color
-        single = len(row.values) == 1
-        # Values beside each other are drawn a little above each other.
-        offsets = np.zeros(1) if single else np.linspace(-0.18, 0.18, len(row.values))
-        y = position + offsets
-        dots: Any = {"s": 13, "alpha": 0.55, "zorder": 3, "color": color}
-        lost = ~row.finished
-        axes.scatter(row.values[row.finished], y[row.finished], marker="o", linewidths=0, **dots)
-        axes.scatter(row.values[lost], y[lost], marker="x", linewidths=0.9, **dots)
-        if np.isfinite([row.low, row.high]).all():
-            axes.hlines(position, row.low, row.high, color=INK, linewidth=1.1, zorder=4)
-        # A single value lies under its middle, which then has its case's colour.
-        axes.vlines(
-            row.middle,
-            position - 0.3,
-            position + 0.3,
-            color=color if single else INK,
-            linewidth=1.4,
-            zorder=5,
-        )
+        _dot_row(axes, position, row, styles[row.case].color)
     axes.set_yticks(range(len(rows)), [shown_case(row.case) for row in rows])
+    # The first row is above.
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
     return np.concatenate([row.values for row in rows])
+
+
+def _dot_row(axes: Axes, position: int, row: DotRow, color: str) -> None:
+    """Draw the row of a case at a position on the ordinate."""
+    is_single = len(row.values) == 1
+    # Values beside each other are drawn a little above each other.
+    offsets = np.zeros(1) if is_single else np.linspace(-0.18, 0.18, len(row.values))
+    y = position + offsets
+    look: Any = {"s": 13, "alpha": 0.55, "zorder": 3, "color": color}
+    finished = row.finished
+    diverged = ~finished
+    axes.scatter(row.values[finished], y[finished], marker="o", linewidths=0, **look)
+    axes.scatter(row.values[diverged], y[diverged], marker="x", linewidths=0.9, **look)
+    if np.isfinite([row.low, row.high]).all():
+        axes.hlines(position, row.low, row.high, color=INK, linewidth=1.1, zorder=4)
+    axes.vlines(
+        row.middle,
+        position - 0.3,
+        position + 0.3,
+        # A single value lies under its middle, which then has its case's colour.
+        color=color if is_single else INK,
+        linewidth=1.4,
+        zorder=5,
+    )
 
 
 class EndLabel(NamedTuple):
@@ -304,8 +328,8 @@ class CostLine(NamedTuple):
     """Costs (K,) over samples (K,): name of the case, and arguments of `Axes.plot`."""
 
     name: str
-    samples: NDArray[np.float64]
-    costs: NDArray[np.float64]
+    samples: Array
+    costs: Array
     look: Mapping[str, Any]
 
 
@@ -365,13 +389,15 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
     for axes, names in labels:
         if not names:
             continue
-        ends = np.array([_height(axes, name.y) for name in names])
-        wanted = np.clip(ends, 0.0, 1.0)
-        highest_first = np.argsort(-wanted, kind="stable")
-        points = axes.get_window_extent().height * 72 / axes.figure.dpi
-        placed = spread(wanted[highest_first], gap=1.25 * END_SIZE / points)
-        for position, index in zip(placed, highest_first, strict=True):
-            _label_end(axes, names[index], float(wanted[index]), float(position))
+        heights = [_height(axes, name.y) for name in names]
+        ends = np.clip(heights, 0.0, 1.0)
+        highest_first = np.argsort(-ends, kind="stable")
+        # A line of text, as a share of the axes' height.
+        axes_points = axes.get_window_extent().height * 72 / axes.figure.dpi
+        gap = 1.25 * END_SIZE / axes_points
+        positions = spread(ends[highest_first], gap)
+        for position, index in zip(positions, highest_first, strict=True):
+            _label_end(axes, names[index], float(ends[index]), float(position))
 
 
 def _height(axes: Axes, y: float) -> float:
@@ -409,7 +435,7 @@ def _label_end(axes: Axes, name: EndLabel, end: float, position: float) -> None:
     )
 
 
-def spread(positions: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
+def spread(positions: Array, gap: float) -> Array:
     """Move positions apart, as little as need be.
 
     The sum of the squared moves is least, within [0, 1]: an isotonic regression of
@@ -424,6 +450,9 @@ def spread(positions: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
     """
     from scipy.optimize import isotonic_regression  # noqa: PLC0415 - a third of a second
 
-    steps = gap * np.arange(len(positions))
-    placed: NDArray[np.float64] = isotonic_regression(positions + steps, increasing=False).x
-    return np.clip(placed, steps[-1], max(1.0, steps[-1])) - steps
+    # With the gaps added, "at least a gap apart" is "not increasing".
+    gaps = gap * np.arange(len(positions))
+    placed: Array = isotonic_regression(positions + gaps, increasing=False).x
+    lowest = gaps[-1]
+    highest = max(1.0, lowest)
+    return np.clip(placed, lowest, highest) - gaps

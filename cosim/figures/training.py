@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -36,7 +37,13 @@ POINTS = 30
 """Fewer values than this are marked one by one."""
 BLOCKS = 4
 """Blocks of θ that are drawn, at most: those that moved most."""
+PANEL_COLUMNS = 4
+"""Panels beside each other in the paper's figure."""
 _LINE: Any = {"markersize": 3, "linewidth": 1.2, "clip_on": False}
+# Of the entries of a block, in turn: solid in every colour, then dashed.
+_ENTRY_LOOKS: Any = [
+    {"linestyle": line, "color": color} for line, color in product(("-", DASHED), ENTRIES)
+]
 
 
 def training_figure(
@@ -59,23 +66,35 @@ def training_figure(
         title: of the figure.
     """
     best = baselines.get("optimal")
-    share = _known(log, "greedy_violating_share")
-    error = _known(log, "td_error")
+    share_samples, share = _known(log, "greedy_violating_share")
+    error_samples, error = _known(log, "td_error")
     moved = _most_moved(theta)
-    panels: dict[str, Callable[[Axes], Sequence[EndLabel]]] = {
-        "regret %" if best is not None else "J per sample": lambda axes: _draw_cost(
-            axes, log, baselines, best
-        )
-    }
-    if share[0].size:
-        panels["greedy: violating samples %"] = lambda axes: _course(
-            axes, share[0], 100 * share[1], LEARNED_COLOR, least=1.0
+    draw_cost = partial(_draw_cost, log=log, baselines=baselines, best=best)
+    panels: dict[str, Callable[[Axes], Sequence[EndLabel]]] = {}
+    panels["J per sample" if best is None else "regret %"] = draw_cost
+    if share.size:
+        panels["greedy: violating samples %"] = partial(
+            _draw_course,
+            samples=share_samples,
+            values=100 * share,
+            color=LEARNED_COLOR,
+            least=1.0,
         )
     # A single error makes no curve.
-    if error[0].size > 1:
-        panels["TD error (r.m.s.)"] = lambda axes: _course(axes, *error, INK, least=1e-12)
+    if error.size > 1:
+        panels["TD error (r.m.s.)"] = partial(
+            _draw_course,
+            samples=error_samples,
+            values=error,
+            color=INK,
+            least=1e-12,
+        )
     if moved:
-        panels["change of θ, by its scale"] = lambda axes: _change(axes, log, moved)
+        panels["change of θ, by its scale"] = partial(
+            _draw_change,
+            samples=log["samples"],
+            moved=moved,
+        )
     columns = len(panels) if len(panels) < 4 else 2
     rows = -(-len(panels) // columns)
     with figure(2.15 * rows + 0.35) as drawn:
@@ -99,15 +118,16 @@ def _most_moved(theta: Mapping[str, Array]) -> dict[str, Array]:
         norm = np.linalg.norm(increments, axis=1)
         if norm.any():
             norms[name] = norm
-    names = sorted(norms, key=lambda name: -float(norms[name][-1]))
-    return {name: norms[name] for name in names[:BLOCKS]}
+    farthest_first = sorted(norms, key=lambda name: -float(norms[name][-1]))
+    return {name: norms[name] for name in farthest_first[:BLOCKS]}
 
 
 def _known(log: Mapping[str, Array], name: str) -> tuple[Array, Array]:
     """Samples and finite values of a column; empty where the log has none."""
-    values = log.get(name, np.full(len(log["samples"]), np.nan))
-    known = np.isfinite(values)
-    return log["samples"][known], values[known]
+    samples = log["samples"]
+    values = log.get(name, np.full(len(samples), np.nan))
+    is_known = np.isfinite(values)
+    return samples[is_known], values[is_known]
 
 
 def _draw_cost(
@@ -135,7 +155,7 @@ def _draw_cost(
     return cost_lines(axes, lines, levels, relative=best is not None)
 
 
-def _course(
+def _draw_course(
     axes: Axes, samples: Array, values: Array, color: str, least: float
 ) -> Sequence[EndLabel]:
     """A line from 0 to `least` or more, logarithmic where it spans decades; it has no name."""
@@ -152,13 +172,13 @@ def _course(
     return ()
 
 
-def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) -> list[EndLabel]:
+def _draw_change(axes: Axes, samples: Array, moved: Mapping[str, Array]) -> list[EndLabel]:
     """Norm of the increments of blocks of θ, each (K,)."""
     labels = []
     top = 0.0
     # No more blocks are drawn than there are colours.
     for color, (name, norm) in zip(ENTRIES, moved.items(), strict=False):
-        axes.plot(log["samples"], norm, color=color, linewidth=1.2)
+        axes.plot(samples, norm, color=color, linewidth=1.2)
         labels.append(EndLabel(symbol(name), float(norm[-1]), color))
         top = max(top, float(norm.max()))
     if top > DECADES:
@@ -179,37 +199,46 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
         td_error: root mean square over the preceding `TD_WINDOW` samples, (K,).
     """
     moving = {name: values for name, values in increments.items() if np.any(values)}
-    # Of the entries of a block, in turn: solid in every colour, then dashed.
-    styles = []
-    for line, color in product(("-", DASHED), ENTRIES):
-        styles.append({"linestyle": line, "color": color})
-    columns = 4
-    rows = -(-len(moving) // columns)
+    rows = -(-len(moving) // PANEL_COLUMNS)
     with figure(1.3 * rows + 2.2) as drawn:
-        grid = drawn.add_gridspec(rows + 1, columns, height_ratios=[*[1.0] * rows, 1.2])
+        grid = drawn.add_gridspec(rows + 1, PANEL_COLUMNS, height_ratios=[*[1.0] * rows, 1.2])
         first: Axes | None = None
         for i, (name, values) in enumerate(moving.items()):
-            axes = drawn.add_subplot(grid[i // columns, i % columns], sharex=first)
+            row, column = divmod(i, PANEL_COLUMNS)
+            axes = drawn.add_subplot(grid[row, column], sharex=first)
             first = first or axes
-            for k, entry in enumerate(values.T):
-                axes.plot(samples, entry, linewidth=0.8, **styles[k % len(styles)])
-            axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
+            _draw_increments(axes, samples, name, values)
             # Samples stand below the lowest panel of each column.
-            axes.tick_params(labelbottom=i + columns >= len(moving))
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
+            is_lowest = i + PANEL_COLUMNS >= len(moving)
+            axes.tick_params(labelbottom=is_lowest)
         axes = drawn.add_subplot(grid[rows, :], sharex=first)
         axes.plot(samples, td_error, color=INK, linewidth=1.0)
         samples_axis(axes, float(samples[-1]), "samples")
         title = f"TD error in the stage cost's unit, r.m.s. of the preceding {TD_WINDOW} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
-        sizes = [values.shape[1] for values in moving.values()]
-        if sizes:
-            handles = []
-            # The largest block has all styles that are drawn.
-            for entry_number, style in enumerate(styles[: max(sizes)], start=1):
-                handle = Line2D([], [], linewidth=1.2, label=str(entry_number), **style)
-                handles.append(handle)
-            title = "entry of its block, in the block's own unit"
-            drawn.legend(handles=handles, loc="outside lower center", ncols=12, title=title)
+        if moving:
+            most_entries = max(values.shape[1] for values in moving.values())
+            _draw_entries_legend(drawn, most_entries)
     return drawn
+
+
+def _draw_increments(axes: Axes, samples: Array, name: str, values: Array) -> None:
+    """Draw the increments (K, entries) of a block of θ."""
+    for k, entry in enumerate(values.T):
+        axes.plot(samples, entry, linewidth=0.8, **_ENTRY_LOOKS[k % len(_ENTRY_LOOKS)])
+    axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
+
+
+def _draw_entries_legend(drawn: Figure, most_entries: int) -> None:
+    """Number the looks of a block's entries, as many as the largest block has."""
+    handles = []
+    for number, look in enumerate(_ENTRY_LOOKS[:most_entries], start=1):
+        handles.append(Line2D([], [], linewidth=1.2, label=str(number), **look))
+    drawn.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=12,
+        title="entry of its block, in the block's own unit",
+    )

@@ -24,6 +24,7 @@ from cosim.figures.style import (
     DASHED,
     INK,
     REFERENCE,
+    LineStyle,
     figure,
     label,
     palette,
@@ -53,36 +54,32 @@ def trajectory_figure(
     """
     scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
-    costs = {"stage_cost": REFERENCE, "penalty": BOUND}
+    cost_colors = {"stage_cost": REFERENCE, "penalty": BOUND}
     left = [*scenario.limits]
-    right = [*scenario.plant.disturbances, *costs]
-    # The columns have as many rows as both numbers of panels divide.
-    rows = int(np.lcm(len(left), len(right)))
-    cells: Any = []
-    for row in range(rows):
-        cells.append([names[row * len(names) // rows] for names in (left, right)])
+    right = [*scenario.plant.disturbances, *cost_colors]
     # Panels on the right may be a little lower than those of the loop.
-    panel_rows = max(len(left), len(right) * 0.8)
-    height = max(1.05 * panel_rows, 2.4) + 0.5
+    n_rows = max(len(left), len(right) * 0.8)
+    height = max(1.05 * n_rows, 2.4) + 0.5
     with figure(height) as drawn:
-        panels = drawn.subplot_mosaic(cells, sharex=True, width_ratios=(1.35, 1.0))
+        panels = drawn.subplot_mosaic(
+            _mosaic(left, right),
+            sharex=True,
+            width_ratios=(1.35, 1.0),
+        )
         for name, axes in panels.items():
             axes.set_ylabel(label(name, trajectory.signals[name].unit), fontsize=7.0)
             for run in beside:
-                values = run[name]
-                lowest = (time[0], np.min(values))
-                highest = (time[0], np.max(values))
-                axes.update_datalim([lowest, highest])
-                axes.autoscale_view()
+                _span(axes, time[0], run[name])
         _loop_panels(panels, time, trajectory, scenario)
         for name in right:
-            color = costs.get(name, REFERENCE)
+            color = cost_colors.get(name, REFERENCE)
             panels[name].step(time, trajectory[name], where="post", color=color, linewidth=0.6)
-        for name in costs:
+        for name in cost_colors:
             _draw_mean(panels[name], float(np.mean(trajectory[name])))
         panels["penalty"].set_ylim(bottom=0.0)
         for names in (left, right):
-            panels[names[-1]].set_xlabel(f"time [{unit}]")
+            lowest = panels[names[-1]]
+            lowest.set_xlabel(f"time [{unit}]")
         # The last input is held for a sample more.
         last_step = time[1] - time[0] if len(time) > 1 else 1.0
         panels[left[0]].set_xlim(time[0], time[-1] + last_step)
@@ -91,49 +88,83 @@ def trajectory_figure(
     return drawn
 
 
+def _mosaic(left: Sequence[str], right: Sequence[str]) -> list[Any]:
+    """Names of the panels of two columns, row by row, each column as high as the other."""
+    # As many rows as both numbers of panels divide: a panel has several of them.
+    n_rows = int(np.lcm(len(left), len(right)))
+    rows = []
+    for row in range(n_rows):
+        left_panel = left[row * len(left) // n_rows]
+        right_panel = right[row * len(right) // n_rows]
+        rows.append([left_panel, right_panel])
+    return rows
+
+
+def _span(axes: Axes, time: float, values: Array) -> None:
+    """Let an ordinate show values; an axis that follows its data needs points, at any time."""
+    axes.update_datalim([(time, np.min(values)), (time, np.max(values))])
+    axes.autoscale_view()
+
+
 def _loop_panels(
     panels: Mapping[str, Axes], time: Array, trajectory: DrawnRun, scenario: Scenario
 ) -> None:
     """Draw states and inputs, their bounds and operating point, and fallback actions."""
     controller = trajectory.controller or "run"
     color = palette([controller])[controller].color
-    references = np.append(scenario.reference_state, scenario.reference_action)
+    operating_point = np.append(scenario.reference_state, scenario.reference_action)
     failed = trajectory["failed"] > 0
-    for name, reference in zip(scenario.limits, references, strict=True):
+    for name, reference in zip(scenario.limits, operating_point, strict=True):
         axes = panels[name]
         _line(axes, time, trajectory, name, color, width=0.9, shade=BOUND)
         _limits(axes, *scenario.limits[name])
         axes.axhline(reference, color=REFERENCE, linewidth=0.7)
         _draw_known(axes, time, trajectory, name)
         if name in scenario.plant.actions and failed.any():
-            values = trajectory[name][failed]
-            axes.plot(time[failed], values, "x", color=BOUND, ms=4, label="fallback")
+            axes.plot(
+                time[failed],
+                trajectory[name][failed],
+                "x",
+                color=BOUND,
+                markersize=4,
+                label="fallback",
+            )
             axes.legend(loc="upper right")
 
 
 def _draw_known(axes: Axes, time: Array, trajectory: DrawnRun, name: str) -> None:
     """Draw what sensors showed of a state, and its estimate, where there are any."""
-    signals = trajectory.signals
-    measured = f"measured[{name}]"
-    estimated = f"estimated[{name}]"
-    if estimated in signals:
-        values = signals[estimated].values
-        axes.plot(time, values, color=INK, linewidth=0.6, linestyle=DASHED, label="estimated")
-    if measured in signals:
-        values = signals[measured].values
-        axes.plot(time, values, ".", color=INK, markersize=2.5, label="measured")
-    if estimated in signals or measured in signals:
-        # Above the panel, where no line runs.
-        axes.legend(
-            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=6.0, borderaxespad=0.2
+    estimate = trajectory.signals.get(f"estimated[{name}]")
+    measurement = trajectory.signals.get(f"measured[{name}]")
+    if estimate is None and measurement is None:
+        return
+    if estimate is not None:
+        axes.plot(
+            time,
+            estimate.values,
+            color=INK,
+            linewidth=0.6,
+            linestyle=DASHED,
+            label="estimated",
         )
+    if measurement is not None:
+        axes.plot(time, measurement.values, ".", color=INK, markersize=2.5, label="measured")
+    # Above the panel, where no line runs.
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=2,
+        fontsize=6.0,
+        borderaxespad=0.2,
+    )
 
 
 def _draw_mean(axes: Axes, mean: float) -> None:
     """Draw a mean as a dotted line, and its number in the corner."""
     axes.axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
+    number = f"{mean:.0f}" if abs(mean) >= 1000 else f"{mean:.4g}"
     axes.annotate(
-        f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
+        f"mean {number}",
         (0.99, 0.95),
         xycoords="axes fraction",
         ha="right",
@@ -144,10 +175,11 @@ def _draw_mean(axes: Axes, mean: float) -> None:
 
 
 def _title(trajectory: DrawnRun, scenario: Scenario) -> str:
-    summary = trajectory.summary()
+    controller = shown_case(trajectory.controller or "run")
     seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
+    summary = trajectory.summary()
     return (
-        f"{shown_case(trajectory.controller or 'run')} on {plain(scenario.name)}{seed}:   "
+        f"{controller} on {plain(scenario.name)}{seed}:   "
         f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
         f"violating {100 * summary['violating_share']:.1f} % of samples"
     )
@@ -164,26 +196,36 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
     scale, unit = time_unit(first.time)
     styles = palette(list(runs))
     with figure(1.2 * len(scenario.limits) + 0.6) as drawn:
-        rows = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, name in zip(rows, scenario.limits, strict=True):
+        panels = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (name, bounds) in zip(panels, scenario.limits.items(), strict=True):
             for controller, run in runs.items():
                 color = styles[controller].color
                 _line(axes, run.time / scale, run, name, color, width=1.1, shade=color)
-            _limits(axes, *scenario.limits[name])
+            _limits(axes, *bounds)
             axes.set_ylabel(label(name, first.signals[name].unit))
+        # The last input is held for a sample more.
         end = first.time[-1] + scenario.sampling_time
-        rows[-1].set_xlabel(f"time [{unit}]")
-        rows[-1].set_xlim(first.time[0] / scale, end / scale)
+        panels[-1].set_xlim(first.time[0] / scale, end / scale)
+        panels[-1].set_xlabel(f"time [{unit}]")
         drawn.align_ylabels()
-        for controller, run in runs.items():
-            summary = run.summary()
-            violating = f"{100 * summary['violating_share']:.0f} % of samples violate"
-            text = f"{shown_case(controller)}: J = {summary['J']:.0f}, {violating}"
-            # An empty line stands for the controller in the legend.
-            rows[0].plot([], [], color=styles[controller].color, label=text)
-        rows[0].plot([], [], color=BOUND, linestyle=DASHED, label="bound")
-        rows[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.2)
+        _draw_costs_legend(panels[0], runs, styles)
     return drawn
+
+
+def _draw_costs_legend(
+    axes: Axes, runs: Mapping[str, DrawnRun], styles: Mapping[str, LineStyle]
+) -> None:
+    """Name each controller above the axes, with its J and the share of violating samples."""
+    for controller, run in runs.items():
+        summary = run.summary()
+        text = (
+            f"{shown_case(controller)}: J = {summary['J']:.0f}, "
+            f"{100 * summary['violating_share']:.0f} % of samples violate"
+        )
+        # An empty line stands for the controller in the legend.
+        axes.plot([], [], color=styles[controller].color, label=text)
+    axes.plot([], [], color=BOUND, linestyle=DASHED, label="bound")
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.2)
 
 
 def animation(
@@ -207,15 +249,15 @@ def animation(
     """
     if Path(path).suffix != ".gif":
         raise FigureError(f"cannot draw '{path}': the file must end in .gif")
+    values = {}
+    for signal in first.scenario.limits:
+        values[signal] = np.concatenate([run[signal] for run in (first, *runs.values())])
     images = []
     for title, run in runs.items():
         drawn = overlay_figure({start: first, name: run})
-        for axes, signal in zip(drawn.axes, first.scenario.limits, strict=True):
-            # All frames have one ordinate, so that the lines alone move.
-            values_of_all = [first[signal]]
-            for frame in runs.values():
-                values_of_all.append(frame[signal])
-            _fix_ordinate(axes, np.concatenate(values_of_all))
+        # All frames have one ordinate, so that the lines alone move.
+        for axes, signal in zip(drawn.axes, values, strict=True):
+            _fix_ordinate(axes, values[signal])
         drawn.axes[0].set_title(title, loc="right", fontsize=8.5, pad=16.0)
         images.append(Image.fromarray(_pixels(drawn)))
     durations = [FRAME] * len(images)
@@ -223,7 +265,12 @@ def animation(
     durations[-1] = 6 * FRAME
     content = BytesIO()
     images[0].save(
-        content, "GIF", save_all=True, append_images=images[1:], loop=0, duration=durations
+        content,
+        "GIF",
+        save_all=True,
+        append_images=images[1:],
+        loop=0,
+        duration=durations,
     )
     return write_atomically(path, content.getvalue())
 
@@ -233,8 +280,10 @@ def _fix_ordinate(axes: Axes, values: Array) -> None:
     margin = 0.05 * float(np.ptp(values)) or 1.0
     low, high = axes.set_ylim(values.min() - margin, values.max() + margin)
     for text in axes.texts:
+        # A bound's name stands at the bound in data, and its `xycoords` differ for x and y.
         if isinstance(text, Annotation) and isinstance(text.xycoords, tuple):
-            text.set_visible(low <= text.xy[1] <= high)
+            _, bound = text.xy
+            text.set_visible(low <= bound <= high)
 
 
 def episode_image(
@@ -252,24 +301,23 @@ def episode_image(
     Returns:
         The image, (height, width, 3).
     """
-    plant = scenario.plant
     samples = np.arange(first, first + len(states), dtype=float)
     seconds: Array = scenario.sampling_time * samples
     scale, unit = time_unit(seconds)
     time = seconds / scale
-    names = [*plant.states, *plant.actions]
-    with figure(1.3 * len(names), 6.0) as drawn:
-        panels = drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        for name, panel in zip(names, panels, strict=True):
-            panel.set_ylabel(label(name, units[name]))
-        n_states = len(plant.states)
-        for i, panel in enumerate(panels[:n_states]):
-            panel.plot(time, states[:, i], color=INK)
-            _limits(panel, scenario.state_lower[i], scenario.state_upper[i])
-        # An action is held from its sample to the next.
-        for j, panel in enumerate(panels[n_states:]):
-            panel.stairs(actions[:, j], time, color=INK, baseline=None)
-            _limits(panel, scenario.action_lower[j], scenario.action_upper[j])
+    values = dict(zip(scenario.plant.states, states.T, strict=True))
+    held_values = dict(zip(scenario.plant.actions, actions.T, strict=True))
+    n_panels = len(scenario.limits)
+    with figure(1.3 * n_panels, 6.0) as drawn:
+        panels = drawn.subplots(n_panels, 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (name, bounds) in zip(panels, scenario.limits.items(), strict=True):
+            axes.set_ylabel(label(name, units[name]))
+            if name in values:
+                axes.plot(time, values[name], color=INK)
+            else:
+                # An action is held from its sample to the next.
+                axes.stairs(held_values[name], time, color=INK, baseline=None)
+            _limits(axes, *bounds)
         panels[-1].set_xlabel(f"time [{unit}]")
         # After a reset there is one state, and no range.
         end = time[-1] if len(time) > 1 else time[0] + 1.0
@@ -279,9 +327,11 @@ def episode_image(
 
 
 def _pixels(drawn: Figure) -> NDArray[np.uint8]:
+    """A figure as an RGB image, (height, width, 3)."""
     canvas: Any = FigureCanvasAgg(drawn)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    rgba = np.asarray(canvas.buffer_rgba())
+    return rgba[..., :3].copy()
 
 
 def time_unit(time: Array) -> tuple[float, str]:
@@ -300,16 +350,22 @@ def _line(
     """Draw a state, or an input, which is held, and shade what is beyond its bounds."""
     values = run[name]
     lower, upper = run.scenario.limits[name]
-    drawstyle = "steps-post" if name in run.scenario.plant.actions else "default"
-    axes.plot(time, values, drawstyle=drawstyle, color=color, linewidth=width)
-    for bound, outside in ((lower, values < lower), (upper, values > upper)):
-        if not outside.any():
+    is_held = name in run.scenario.plant.actions
+    axes.plot(
+        time,
+        values,
+        drawstyle="steps-post" if is_held else "default",
+        color=color,
+        linewidth=width,
+    )
+    for bound, violates in ((lower, values < lower), (upper, values > upper)):
+        if not violates.any():
             continue
         axes.fill_between(
             time,
             values,
             bound,
-            where=list(outside),
+            where=list(violates),
             color=shade,
             alpha=0.3,
             linewidth=0,
@@ -321,25 +377,14 @@ def _limits(axes: Axes, lower: float, upper: float) -> None:
     """Draw a bound where it is no farther from the data than they are wide, else name it."""
     low, high = axes.dataLim.intervaly
     span = max(high - low, 1e-9)
+    bounds = {"≥": (lower, low - lower), "≤": (upper, upper - high)}
     far = []
-    for sign, bound, distance in (("≥", lower, low - lower), ("≤", upper, upper - high)):
+    for sign, (bound, distance) in bounds.items():
         text = f"{sign} {bound:g}"
-        if distance >= span:
+        if distance < span:
+            _draw_bound(axes, bound, text)
+        else:
             far.append(text)
-            continue
-        axes.axhline(bound, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
-        # Right of the axes: within, the data would hide it.
-        axes.annotate(
-            text,
-            (1.0, bound),
-            xycoords=("axes fraction", "data"),
-            xytext=(3, 0),
-            textcoords="offset points",
-            ha="left",
-            va="center",
-            fontsize=6.5,
-            color=BOUND,
-        )
     if far:
         axes.annotate(
             f"bound {', '.join(far)}",
@@ -350,3 +395,19 @@ def _limits(axes: Axes, lower: float, upper: float) -> None:
             fontsize=6.5,
             color=BOUND,
         )
+
+
+def _draw_bound(axes: Axes, bound: float, text: str) -> None:
+    """Draw a bound across the axes, named right of them: within, the data would hide it."""
+    axes.axhline(bound, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
+    axes.annotate(
+        text,
+        (1.0, bound),
+        xycoords=("axes fraction", "data"),
+        xytext=(3, 0),
+        textcoords="offset points",
+        ha="left",
+        va="center",
+        fontsize=6.5,
+        color=BOUND,
+    )

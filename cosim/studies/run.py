@@ -44,19 +44,38 @@ TRAINED = (LOG, PARAMETERS)
 GREEDY = "greedy.csv"
 FAILURE = "failure.txt"
 RUN_FILES = (
-    CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, TIMING,
-    "trajectory-*.csv", "greedy-*.csv", "online*.csv",
-)  # fmt: skip
+    CHECKPOINT,
+    LOG,
+    PARAMETERS,
+    EVALUATION,
+    GREEDY,
+    FAILURE,
+    TIMING,
+    "trajectory-*.csv",
+    "greedy-*.csv",
+    "online*.csv",
+)
 """Files that a run writes beside its run.json."""
 INDICATORS = (
-    "J", "economic_cost", "mean_violation", "violating_share", "input_effort", "failures",
-)  # fmt: skip
+    "J",
+    "economic_cost",
+    "mean_violation",
+    "violating_share",
+    "input_effort",
+    "failures",
+)
 NOISE_KEY = ["seed", "steps", "burn_in"]
 """Columns that say what noise a row was measured on."""
 TYPES: dict[str, Any] = {
-    **dict.fromkeys(("scenario", "case", "status", "run"), str),
-    **dict.fromkeys(("training_seed", "samples", "plant_samples"), "Int64"),
-    **dict.fromkeys(("steps", "burn_in"), int),
+    "scenario": str,
+    "case": str,
+    "status": str,
+    "run": str,
+    "training_seed": "Int64",
+    "samples": "Int64",
+    "plant_samples": "Int64",
+    "steps": int,
+    "burn_in": int,
     "seed": "uint64",
 }
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
@@ -83,17 +102,25 @@ def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = 
 
     try:
         # As texts: an empty cell alone is missing, not a case called NA.
-        texts = pd.read_csv(path, dtype="string", keep_default_na=False, na_values=[""])
-        chosen = columns or list(texts)
-        further = [name for name in needed if name not in chosen]
-        return typed(texts[[*chosen, *further]])
+        texts = pd.read_csv(
+            path,
+            dtype="string",
+            keep_default_na=False,
+            na_values=[""],
+        )
+        names = list(columns or texts)
+        for name in needed:
+            if name not in names:
+                names.append(name)
+        return typed(texts[names])
     except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise StudyError(f"'{path}' is missing or damaged: {error}") from None
 
 
 def typed(frame: pd.DataFrame) -> pd.DataFrame:
     """A frame with the types of `TYPES`."""
-    return frame.astype({name: TYPES.get(name, float) for name in frame})
+    types = {name: TYPES.get(name, float) for name in frame}
+    return frame.astype(types)
 
 
 def frame_csv(frame: pd.DataFrame) -> str:
@@ -175,7 +202,8 @@ class Run:
 
     def __post_init__(self) -> None:
         for name in (self.scenario.name, self.case):
-            if not name.strip(". ") or "/" in name or "\\" in name:
+            is_dots = not name.strip(". ")
+            if is_dots or "/" in name or "\\" in name:
                 raise StudyError(
                     f"'{name}' cannot name a scenario, case or controller: it would name a folder "
                     "elsewhere; give it another name"
@@ -189,7 +217,8 @@ class Run:
     @property
     def folder(self) -> Path:
         """Where its files are, relative to the study's folder."""
-        folder = Path(RUNS_FOLDER, folder_name(self.scenario.name), folder_name(self.case))
+        scenario = folder_name(self.scenario.name)
+        folder = Path(RUNS_FOLDER, scenario, folder_name(self.case))
         return folder if self.seed is None else folder / str(self.seed)
 
     def __str__(self) -> str:
@@ -206,8 +235,10 @@ class Run:
     @property
     def samples(self) -> int:
         """Plant samples of the run; those of greedy evaluations while training apart."""
-        trained = 0 if self.training is None else self.training.samples
-        return trained + sum(noise.samples for noise in self.noise.values())
+        evaluated = sum(noise.samples for noise in self.noise.values())
+        if self.training is None:
+            return evaluated
+        return self.training.samples + evaluated
 
     @property
     def length(self) -> int:
@@ -220,8 +251,10 @@ def functions_for(noise: Mapping[str, Noise]) -> str:
 
     The two agree but for last digits, which are not to differ among the rows of one table.
     """
-    long = max(noise.length for noise in noise.values()) >= LONG
-    return COMPILED if long and switch() != "never" else INTERPRETED
+    longest = max(evaluation.length for evaluation in noise.values())
+    if longest >= LONG and switch() != "never":
+        return COMPILED
+    return INTERPRETED
 
 
 # A worker's part of a run
@@ -356,21 +389,39 @@ class RunStore:
         """Whether the folder's files do not hold for the run, or cannot be known to; say why."""
         before = self.about.get("facts")
         facts = self._facts()
-        unknown = [name for name, value in facts.items() if value == UNKNOWN]
-        if before == facts and not unknown:
-            return False
         if before is None:
             return True
         if before != facts:
             names = ", ".join(changed(before, facts))
             self.remarks.append(f"{names} changed since these runs; they are done anew")
-        else:
-            what = f"the code of {', '.join(unknown)} cannot be known"
-            self.remarks.append(f"{what}: {self.run} is done anew")
-        return True
+            return True
+        unknown = [name for name, value in facts.items() if value == UNKNOWN]
+        if unknown:
+            names = ", ".join(unknown)
+            self.remarks.append(f"the code of {names} cannot be known: {self.run} is done anew")
+            return True
+        return False
 
     def _intact_run_file(self) -> dict[str, Any]:
         """run.json if it and its hashed files are intact, else {}."""
+        about = self._read_run_file()
+        for name, digest in list(about.get("files", {}).items()):
+            path = self.folder / name
+            if file_hash(path) == digest:
+                continue
+            self.remarks.append(f"'{path}' is not as it was written; made anew")
+            # Without its training no evaluation of the run holds.
+            if name in TRAINED:
+                return {}
+            path.unlink(missing_ok=True)
+            del about["files"][name]
+        return about
+
+    def _read_run_file(self) -> dict[str, Any]:
+        """run.json; {} if it is damaged or there is no file of the run.
+
+        Raises StudyError where files lie there without it.
+        """
         path = self.folder / RUN_FILE
         if not path.is_file():
             if self._files():
@@ -382,19 +433,10 @@ class RunStore:
         try:
             about = read_json(path, f"'{path}'", StudyError)
             about["files"] = dict(about.get("files", {}))
-            dict(about["facts"])
+            about["facts"] = dict(about["facts"])
         except (StudyError, KeyError, TypeError, ValueError):
             self.remarks.append(f"'{path}' is damaged; the run is done anew")
             return {}
-        for name, digest in list(about["files"].items()):
-            if file_hash(self.folder / name) == digest:
-                continue
-            self.remarks.append(f"'{self.folder / name}' is not as it was written; made anew")
-            # Without its training no evaluation of the run holds.
-            if name in TRAINED:
-                return {}
-            (self.folder / name).unlink(missing_ok=True)
-            del about["files"][name]
         return about
 
     def _files(self) -> list[Path]:
@@ -418,27 +460,31 @@ class RunStore:
 
     def indicators(self, file: str) -> dict[int, dict[str, Any]]:
         """Content of a file by noise seed, of runs as long as the plan's; {} of a damaged one."""
-        if file in self._measured:
-            return self._measured[file]
+        if file not in self._measured:
+            self._measured[file] = self._read_indicators(file)
+        return self._measured[file]
+
+    def _read_indicators(self, file: str) -> dict[int, dict[str, Any]]:
+        """`indicators` as they are on the disk."""
         path = self.folder / file
+        if not path.is_file():
+            return {}
+        columns = () if file == TIMING else INDICATORS
+        try:
+            rows = read_table(path, columns, NOISE_KEY).set_index("seed")
+        except StudyError:
+            self.remarks.append(f"'{path}' is damaged; made anew")
+            return {}
+        # Rows of an earlier study in this folder may be of runs of another length.
         noise = self._noise(file)
-        measured: dict[int, dict[str, Any]] = {}
-        self._measured[file] = measured
-        if path.is_file():
-            columns = () if file == TIMING else INDICATORS
-            try:
-                rows = read_table(path, columns, NOISE_KEY).set_index("seed")
-            except StudyError:
-                self.remarks.append(f"'{path}' is damaged; made anew")
-                return measured
-            # Rows of an earlier study in this folder may be of runs of another length.
-            same_length = (rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)
-            rows = rows[same_length]
-            rows = rows[~rows.index.duplicated()].drop(columns=["steps", "burn_in"])
-            measured.update(rows.to_dict("index"))
+        same_length = (rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)
+        rows = rows[same_length].drop(columns=["steps", "burn_in"])
+        rows = rows[~rows.index.duplicated()]
+        measured: dict[int, dict[str, Any]] = rows.to_dict("index")
         return measured
 
     def _noise(self, file: str) -> Noise:
+        """Noise on which a file's rows are measured; times are those of the evaluation."""
         return self.run.noise[EVALUATION if file == TIMING else file]
 
     def measured(self, file: str) -> pd.DataFrame:
@@ -452,8 +498,10 @@ class RunStore:
         """Noise seeds that a file lacks."""
         noise = self.run.noise[file]
         if noise.whole:
-            return () if (self.folder / file).is_file() else noise.seeds
-        return tuple(seed for seed in noise.seeds if seed not in self.indicators(file))
+            is_there = (self.folder / file).is_file()
+            return () if is_there else noise.seeds
+        measured = self.indicators(file)
+        return tuple(seed for seed in noise.seeds if seed not in measured)
 
     def items(self, shared_disk: bool) -> Iterator[tuple[str, TrainItem | MeasureItem]]:
         """Give out what can be done now, and count what is done.
@@ -476,10 +524,12 @@ class RunStore:
         for file, noise in run.noise.items():
             missing = noise._replace(seeds=self.missing(file))
             self.done += noise.samples - missing.samples
-            if missing.seeds:
-                n_seeds = max(1, ITEM_SAMPLES // noise.length)
-                for part in self._evaluation(file, missing).parts(n_seeds):
-                    yield file, part
+            if not missing.seeds:
+                continue
+            seeds_of_an_item = max(1, ITEM_SAMPLES // noise.length)
+            evaluation = self._evaluation(file, missing)
+            for part in evaluation.parts(seeds_of_an_item):
+                yield file, part
 
     def _evaluation(self, file: str, noise: Noise) -> MeasureItem:
         """Evaluate the run's controller, or its θ, on some noise."""
@@ -494,11 +544,12 @@ class RunStore:
         # In operation: the policy of the time on the plant of the time.
         from cosim.studies.operation import optimum_at, plant_at, theta_at  # noqa: PLC0415
 
-        plant = plant_at(run.scenario, mark * run.scenario.sampling_time)
+        time_of_mark = mark * run.scenario.sampling_time
+        item = replace(item, plant=plant_at(run.scenario, time_of_mark))
         if run.training is None:
-            return replace(item, controller=partial(optimum_at, sample=mark), plant=plant)
-        theta = theta_at((self.folder / LOG).read_text("utf-8"), mark)
-        return replace(item, theta=theta, plant=plant)
+            return replace(item, controller=partial(optimum_at, sample=mark))
+        log = (self.folder / LOG).read_text("utf-8")
+        return replace(item, theta=theta_at(log, mark))
 
     def store_training(self, result: Trained) -> None:
         """Store the result of the training; run.json is written last."""
@@ -506,14 +557,15 @@ class RunStore:
         write_atomically(self.folder / LOG, result.log)
         write_atomically(self.folder / PARAMETERS, result.parameters)
         self.done = result.samples
+        timing = {
+            "wall_seconds": result.wall_seconds,
+            "processor_seconds": dict(result.processor_seconds),
+        }
         self._note(
             status=result.status,
             samples=result.samples,
             plant_samples=result.plant_samples,
-            timing={
-                "wall_seconds": result.wall_seconds,
-                "processor_seconds": dict(result.processor_seconds),
-            },
+            timing=timing,
             files={name: file_hash(self.folder / name) for name in TRAINED},
         )
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
@@ -543,7 +595,6 @@ class RunStore:
         """Write the tables that have changed."""
         import pandas as pd  # noqa: PLC0415
 
-        # A table is written whole each time: the pause keeps that a small share of the work.
         clock = time.monotonic()
         while self._unwritten:
             file = self._unwritten.pop()
@@ -555,19 +606,21 @@ class RunStore:
             rows.insert(1, "steps", noise.steps)
             rows.insert(2, "burn_in", noise.burn_in)
             write_atomically(self.folder / file, frame_csv(rows))
-        self._quiet_until = time.monotonic() + PAUSE * (time.monotonic() - clock)
+        # A table is written whole each time: the pause keeps that a small share of the work.
+        now = time.monotonic()
+        self._quiet_until = now + PAUSE * (now - clock)
 
     def seal(self) -> None:
         """Write the hashes of a finished run's files to run.json."""
         is_trained = self.run.training is None or bool(self.status)
-        lacks_noise = any(self.missing(file) for file in self.run.noise)
-        self.complete = is_trained and not lacks_noise
+        is_evaluated = not any(self.missing(file) for file in self.run.noise)
+        self.complete = is_trained and is_evaluated
         if not self.complete:
             return
         self.flush()
-        # Times differ from run to run: they are no result.
         hashes = {}
         for path in self._files():
+            # Times differ from run to run: they are no result.
             if path.name != TIMING:
                 hashes[path.name] = file_hash(path)
         if self.about.get("files") != hashes:
@@ -575,9 +628,10 @@ class RunStore:
 
     def _unseal(self) -> None:
         """Remove the hashes before more is written, but those of the training's own files."""
-        files = self.about.get("files", {})
-        if files.keys() - TRAINED:
-            self._note(files={name: files[name] for name in files.keys() & TRAINED})
+        hashes = self.about.get("files", {})
+        of_training = {name: digest for name, digest in hashes.items() if name in TRAINED}
+        if of_training != hashes:
+            self._note(files=of_training)
 
 
 # The giving out of the work
@@ -615,12 +669,12 @@ class Runner:
         self.stores = {str(run): RunStore(out, run) for run in runs}
         self.failures: dict[str, Failure] = {}
         """The first failure of each run that failed."""
-        self.remarks: list[str] = []
-        """What was changed or damaged and is done anew, in words."""
+        # Runs of one case have the same remarks; a dictionary has each once, in their order.
+        remarks: dict[str, None] = {}
         for store in self.stores.values():
-            for remark in store.remarks:
-                if remark not in self.remarks:
-                    self.remarks.append(remark)
+            remarks.update(dict.fromkeys(store.remarks))
+        self.remarks = list(remarks)
+        """What was changed or damaged and is done anew, in words."""
 
     def run(self, jobs: int, scheduler: str | None) -> None:
         """Do all that is not done; failed runs do not stop the others.
@@ -680,11 +734,13 @@ class Runner:
         self._tell(line)
 
     def _tell(self, line: str) -> None:
-        complete = sum(store.complete for store in self.stores.values())
-        state = f"{complete}/{len(self.stores)} runs"
+        """Report the state of all runs, and a line on an event."""
+        stores = self.stores.values()
+        n_complete = sum(store.complete for store in stores)
+        state = f"{n_complete}/{len(stores)} runs"
         if self.failures:
             state += f", {len(self.failures)} failed"
-        samples_done = sum(store.done for store in self.stores.values())
+        samples_done = sum(store.done for store in stores)
         self._report(samples_done, state, line)
 
 
@@ -693,5 +749,6 @@ def _end_of_run(name: str, store: RunStore) -> str:
     indicators = store.indicators(EVALUATION)
     costs = [indicators[seed]["J"] for seed in store.run.noise[EVALUATION].seeds]
     line = f"{name}: J {sum(costs) / len(costs):.6g}"
-    status = store.status.partition(":")[0]
+    # Without the reason of a divergence, which was reported as it happened.
+    status, _, _ = store.status.partition(":")
     return f"{line}, {status}" if status else line

@@ -5,15 +5,18 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from pydantic import Field
 
 from cosim.core.errors import ResultsError
 from cosim.core.files import read_toml, write_atomically
+from cosim.core.protocols import Array
 from cosim.core.scenario import Table
 from cosim.core.validation import instead, validated
 from cosim.evaluation import EVALUATION, TIMING
@@ -96,14 +99,13 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     left_out = []
     for path in sorted(out.rglob("*")):
         relative = path.relative_to(out)
-        kept = path.suffix in STORED_SUFFIXES or path.name == ABOUT
-        is_of_a_run = relative.parts[0] == RUNS_FOLDER
-        if not path.is_file() or not kept or is_of_a_run or path.name == TIMING:
+        is_stored = path.suffix in STORED_SUFFIXES or path.name == ABOUT
+        if not is_stored or _is_left_out(relative) or not path.is_file():
             continue
         content = path.read_bytes()
         if path.suffix == ".csv":
             # A last bit is no change.
-            table = pd.read_csv(path, dtype=str, na_filter=False).map(_rounded_cell)
+            table = _texts(path).map(_rounded_cell)
             content = frame_csv(table).encode()
         if len(content) > LARGEST:
             left_out.append(relative.as_posix())
@@ -113,6 +115,16 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     shutil.rmtree(target, ignore_errors=True)
     fresh.replace(target)
     return left_out
+
+
+def _is_left_out(relative: Path) -> bool:
+    """Whether a file of a study's folder is a run's own or holds times, and is no result."""
+    return relative.parts[0] == RUNS_FOLDER or relative.name == TIMING
+
+
+def _texts(path: Path) -> pd.DataFrame:
+    """A table with its cells as they stand in the file."""
+    return pd.read_csv(path, dtype=str, na_filter=False)
 
 
 def draw_stored(folder: Path, name: str) -> list[str]:
@@ -130,19 +142,23 @@ def draw_stored(folder: Path, name: str) -> list[str]:
     """
     stored = folder / name
     results = StudyResults.load(stored)
-    names: list[str] = []
-    for of_scenario in results.draw(stored / FOLDER, ("svg",)).values():
-        names += of_scenario
-    if results.about["pictures"]:  # of the trajectories and logs that the study keeps
-        names += draw_kept(plan(Study.load(folder / f"{name}.toml")), stored, ("svg",))
+    names_by_scenario = results.draw(stored / FOLDER, ("svg",))
+    names = list(chain(*names_by_scenario.values()))
+    # Of the trajectories and logs that the study keeps.
+    if results.about["pictures"]:
+        study = Study.load(folder / f"{name}.toml")
+        names += draw_kept(plan(study), stored, ("svg",))
     return names
 
 
 def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
     """Write README.md: title, tables and links of every stored study."""
-    there = [name for name in studies if (folder / name / ABOUT).is_file()]
-    results = {name: StudyResults.load(folder / name) for name in there}
-    write_atomically(folder / "README.md", rendered("readme.md", studies=studies, results=results))
+    results = {}
+    for name in studies:
+        if (folder / name / ABOUT).is_file():
+            results[name] = StudyResults.load(folder / name)
+    text = rendered("readme.md", studies=studies, results=results)
+    write_atomically(folder / "README.md", text)
 
 
 class Tolerance(Table):
@@ -181,9 +197,10 @@ def compared_tables(folder: Path) -> dict[str, list[str]]:
     tables: dict[str, list[str]] = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
-        top = relative.parts[0]
-        if path.suffix not in (".csv", ".toml") or relative.name == TIMING or top == RUNS_FOLDER:
+        if path.suffix not in (".csv", ".toml") or _is_left_out(relative):
             continue
+        # A table is of the kind of its folder, if it is in one.
+        top = relative.parts[0]
         keys = KEY_COLUMNS.get(top)
         if keys is None:
             raise ResultsError(
@@ -211,23 +228,26 @@ def table_differences(
         ResultsError: A stored table is damaged, evaluation or curves are missing, or a column has
             no tolerance.
     """
-    wanted, computed = compared_tables(stored), compared_tables(now)
+    wanted = compared_tables(stored)
+    computed = compared_tables(now)
     for table in (EVALUATION, CURVES):
         if table not in wanted:
             raise ResultsError(
                 f"the stored table '{stored / table}' is missing; make it with: "
                 f"cosim results update {name}"
             )
-    lines = [
-        f"{name}: {table} is computed but not stored" for table in computed if table not in wanted
-    ]
+    lines = []
+    for table in computed:
+        if table not in wanted:
+            lines.append(f"{name}: {table} is computed but not stored")
     in_folders_first = sorted(wanted, key=lambda table: ("/" not in table, table))
     for table in in_folders_first:
         if table not in computed:
             lines.append(f"{name}: {table} is stored but not computed any more")
             continue
-        before = _read_stored(stored / table, wanted[table])
-        after = _read_stored(now / table, wanted[table])
+        keys = wanted[table]
+        before = _read_stored(stored / table, keys)
+        after = _read_stored(now / table, keys)
         lines += _table_differences(f"{name}/{table}", before, after, tolerances)
     return lines
 
@@ -239,42 +259,35 @@ def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
     units.
     """
     try:
-        if path.suffix == ".toml":
-            frame = _theta_table(path)
-        else:
-            frame = pd.read_csv(path, dtype=str, na_filter=False)
+        texts = _theta_table(path) if path.suffix == ".toml" else _texts(path)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise ResultsError(f"the stored table '{path}' cannot be read: {error}") from None
     units: dict[str, str] = {}
-    names: dict[str, str] = {}
-    for title in frame:
-        name, _, unit = title.partition(" [")
-        names[title] = name
-        units[name] = unit.removesuffix("]")
     columns: dict[str, list[str] | list[float]] = {}
     try:
-        for title in frame:
-            name = names[title]
-            cells = [_rounded_cell(cell) for cell in frame[title]]
+        for title in texts:
+            # A column is called `NAME [UNIT]`, or by its name alone.
+            name, _, unit = title.partition(" [")
+            units[name] = unit.removesuffix("]")
+            cells = [_rounded_cell(cell) for cell in texts[title]]
             if name in keys or name in WORD_COLUMNS:
                 columns[name] = cells
             else:
                 columns[name] = [float(cell or "nan") for cell in cells]
-        frame = pd.DataFrame(columns).set_index(keys)
+        table = pd.DataFrame(columns).set_index(keys)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the stored table '{path}' is damaged: {error}") from None
-    if not frame.index.is_unique:
-        raise ResultsError(f"'{path}' has two rows {frame.index[frame.index.duplicated()][0]}")
-    frame.attrs = units
-    return frame
+    if not table.index.is_unique:
+        twice = table.index[table.index.duplicated()][0]
+        raise ResultsError(f"'{path}' has two rows {twice}")
+    table.attrs = units
+    return table
 
 
 def _theta_table(path: Path) -> pd.DataFrame:
     """A θ file as a table of one row: its hash, and each number of θ under its name in a log."""
     document = read_toml(path, f"'{path}'", ResultsError)
-    row: dict[str, str] = {}
-    row["schema"] = str(document.get("schema", ""))
-    row["hash"] = str(document.get("hash", ""))
+    row = {name: str(document.get(name, "")) for name in ("schema", "hash")}
     blocks: Mapping[str, object] = document.get("theta", {})
     for block, values in blocks.items():
         array = np.asarray(values, dtype=np.float64)
@@ -294,48 +307,64 @@ def _table_differences(
     First rows that only one of them has, then the first differing row of each column, in the order
     of the rows, then columns that only one of them has.
     """
-    lines, lost = [], []
-    for table, other, rows, columns in (
+    lone_columns = []
+    lines = []
+    for table, other, rows_are, columns_are in (
         (stored, now, "stored but not computed any more", "stored, not computed"),
         (now, stored, "computed but not stored", "not stored"),
     ):
-        lone_rows = table.index.difference(other.index, sort=False)
-        if len(lone_rows):
-            lines.append(f"{name}: row {_row(table, lone_rows[0])} is {rows}")
-        lone_columns = table.columns.difference(other.columns, sort=False)
-        if len(lone_columns):
-            lost.append(f"{name}: signal {', '.join(lone_columns)} is {columns}")
-    common = stored.index.intersection(now.index, sort=False)
-    units = now.attrs | stored.attrs
+        rows = table.index.difference(other.index, sort=False)
+        if len(rows):
+            lines.append(f"{name}: row {_row(table, rows[0])} is {rows_are}")
+        columns = table.columns.difference(other.columns, sort=False)
+        if len(columns):
+            lone_columns.append(f"{name}: signal {', '.join(columns)} is {columns_are}")
+    common_rows = stored.index.intersection(now.index, sort=False)
     # Taken once: to take them for each signal is most of the time that a check needs.
-    stored_rows, rows_now = stored.loc[common], now.loc[common]
-    first: list[tuple[int, str]] = []
+    stored_rows = stored.loc[common_rows]
+    rows_now = now.loc[common_rows]
+    units = now.attrs | stored.attrs
+    first_differences = []
     for signal in stored.columns.intersection(now.columns, sort=False):
-        before, after = stored_rows[signal].to_numpy(), rows_now[signal].to_numpy()
-        if signal in WORD_COLUMNS:
-            differs = before != after
-            bound = ""
-        else:
+        tolerance = None
+        if signal not in WORD_COLUMNS:
             tolerance = _tolerance_of(signal, units[signal], tolerances)
-            differs = ~np.isclose(after, before, 0.0, tolerance.absolute, equal_nan=True)
-            bound = f", tolerance {tolerance.absolute:g} {tolerance.unit.removeprefix('1')}"
+        before = stored_rows[signal].to_numpy()
+        after = rows_now[signal].to_numpy()
+        differs = _differs(before, after, tolerance)
         if not differs.any():
             continue
-        k = int(np.argmax(differs))
-        values = f"{after.tolist()[k]!r} now, {before.tolist()[k]!r} stored"
-        text = f"row {_row(stored, common[k])}: signal {signal} is {values}{bound}"
-        first.append((k, f"{name}: {text}".rstrip()))
-    in_order_of_rows = [text for _, text in sorted(first, key=lambda item: item[0])]
-    return lines + in_order_of_rows + lost
+        first = int(np.argmax(differs))
+        text = (
+            f"{name}: row {_row(stored, common_rows[first])}: signal {signal} is "
+            f"{after.tolist()[first]!r} now, {before.tolist()[first]!r} stored"
+        )
+        if tolerance is not None:
+            unit = tolerance.unit.removeprefix("1")
+            text += f", tolerance {tolerance.absolute:g} {unit}"
+        first_differences.append((first, text.rstrip()))
+    first_differences.sort(key=lambda difference: difference[0])
+    lines += [text for _, text in first_differences]
+    return lines + lone_columns
+
+
+def _differs(before: Array, after: Array, tolerance: Tolerance | None) -> NDArray[np.bool_]:
+    """Which of the values (K,) differ: words at all, numbers by more than their tolerance."""
+    if tolerance is None:
+        return np.asarray(before != after)
+    is_close = np.isclose(after, before, rtol=0.0, atol=tolerance.absolute, equal_nan=True)
+    return ~is_close
 
 
 def _tolerance_of(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
     """The signal's own tolerance, else the first matching pattern's (`theta *`)."""
-    names = [signal, *(name for name in tolerances if fnmatchcase(signal, name))]
-    fitting = [name for name in names if name in tolerances]
-    if not fitting:
+    patterns = [name for name in tolerances if fnmatchcase(signal, name)]
+    if signal in tolerances:
+        tolerance = tolerances[signal]
+    elif patterns:
+        tolerance = tolerances[patterns[0]]
+    else:
         raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
-    tolerance = tolerances[fitting[0]]
     if unit and unit != tolerance.unit:
         raise ResultsError(
             f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in '{tolerance.unit}'"
@@ -344,6 +373,7 @@ def _tolerance_of(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -
 
 
 def _row(table: pd.DataFrame, row: object) -> str:
+    """The keys of a row of a table, in words."""
     values = row if isinstance(row, tuple) else (row,)
     pairs = zip(table.index.names, values, strict=True)
     return ", ".join(f"{key}={value}" for key, value in pairs if value)
@@ -351,11 +381,15 @@ def _row(table: pd.DataFrame, row: object) -> str:
 
 def _rounded_cell(cell: str) -> str:
     """A cell as tables store it: numbers with eight digits, whole ones and words as they are."""
+    if _is(int, cell) or not _is(float, cell):
+        return cell
+    return f"{float(cell):.{DIGITS}g}"
+
+
+def _is(number: type[int] | type[float], text: str) -> bool:
+    """Whether a text is a number of a type."""
     try:
-        int(cell)
+        number(text)
     except ValueError:
-        try:
-            return f"{float(cell):.{DIGITS}g}"
-        except ValueError:
-            return cell
-    return cell
+        return False
+    return True

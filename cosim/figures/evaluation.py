@@ -68,10 +68,10 @@ def _draw_costs(
     for name, costs in controllers.items():
         values = costs.J.to_numpy()
         if optimal is None:
-            rows.append(_row(name, values, mean_of(values)))
+            rows.append(_dots(name, values, mean_of(values)))
         else:
             in_percent = 100 * regret_terms(values, optimal)
-            rows.append(_row(name, in_percent, regret(values, optimal), scale=100.0))
+            rows.append(_dots(name, in_percent, regret(values, optimal), scale=100.0))
     values = dot_rows(axes, rows, styles)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
@@ -85,7 +85,7 @@ def _draw_costs(
     axes.set_xlabel("J per sample, 95 % interval")
 
 
-def _row(name: str, values: Array, estimate: Estimate, scale: float = 1.0) -> DotRow:
+def _dots(name: str, values: Array, estimate: Estimate, scale: float = 1.0) -> DotRow:
     """A controller's values (S,) and their mean with its interval, which is multiplied."""
     low, high = estimate.interval or (np.nan, np.nan)
     return DotRow(
@@ -120,6 +120,7 @@ def _draw_pareto(
             label="no other is better in both",
         )
         axes.legend(loc="best")
+    # Dots of the seeds below the means of all.
     for name, costs in controllers.items():
         color = styles[name].color
         axes.plot(
@@ -142,6 +143,7 @@ def _draw_pareto(
             linewidth=1.0,
         )
     top = max(float(costs.mean_violation.max()) for costs in controllers.values())
+    # Linear near 0, where controllers are that never violate a bound.
     if top >= DECADE * VIOLATION:
         axes.set_xscale("symlog", linthresh=VIOLATION, linscale=0.5)
         axes.set_xlim(-0.2 * VIOLATION, 1.6 * top)

@@ -103,6 +103,7 @@ def save(drawn: Figure, path: str | Path) -> Path:
     if kind not in ("png", "svg"):
         raise FigureError(f"cannot draw '{path}': the file must end in .png or .svg")
     content = io.BytesIO()
+    # Not the user's backend, which may need a screen.
     FigureCanvasAgg(drawn)
     with mpl.rc_context(fname=_STYLE):
         # The SVG writer adds the date unless told not to.
@@ -173,6 +174,7 @@ def _rule(name: str, endings: Sequence[str]) -> str:
     head = name.partition("(")[0]
     for ending in endings:
         head = head.removesuffix(ending)
+    # `fixed-late` is of `fixed`, and `fixedpoint` is not; of several rules the longest one fits.
     known = [rule for rule in _KNOWN if f"{head}-".startswith(f"{rule}-")]
     return max(known, key=len, default=head)
 
@@ -180,6 +182,7 @@ def _rule(name: str, endings: Sequence[str]) -> str:
 def lighten(color: str) -> str:
     """A colour, lightened where a dark ground would hide it."""
     rgb = to_rgb(color)
+    # Bright enough on a dark ground.
     if max(rgb) > 0.55:
         return color
     hue, lightness, saturation = rgb_to_hls(*rgb)
@@ -385,6 +388,7 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
         drawn: the figure; limits and scales of the ordinates must be set before.
         labels: axes, each with its lines' names.
     """
+    # Where a line ends on the page is known once the figure is laid out.
     drawn.draw_without_rendering()
     for axes, names in labels:
         if not names:

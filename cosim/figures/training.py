@@ -168,6 +168,7 @@ def _draw_course(
     if 0 < DECADES * low < top:
         axes.set_yscale("log")
     else:
+        # A little below 0, where markers would be cut.
         axes.set_ylim(-0.04 * top, 1.1 * top)
     return ()
 
@@ -181,6 +182,7 @@ def _draw_change(axes: Axes, samples: Array, moved: Mapping[str, Array]) -> list
         axes.plot(samples, norm, color=color, linewidth=1.2)
         labels.append(EndLabel(symbol(name), float(norm[-1]), color))
         top = max(top, float(norm.max()))
+    # Linear below 1, since every increment begins at 0.
     if top > DECADES:
         axes.set_yscale("symlog", linthresh=1.0)
         axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
@@ -198,6 +200,7 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
         increments: θ − θ₀ of each block by its name, (K, entries).
         td_error: root mean square over the preceding `TD_WINDOW` samples, (K,).
     """
+    # A rule learns some blocks of θ only.
     moving = {name: values for name, values in increments.items() if np.any(values)}
     rows = -(-len(moving) // PANEL_COLUMNS)
     with figure(1.3 * rows + 2.2) as drawn:

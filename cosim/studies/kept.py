@@ -37,6 +37,7 @@ def keep_files(plan: StudyPlan, out: Path) -> None:
     """
     for run in plan.runs:
         for name, kept in run.kept.items():
+            # A run that is not finished may lack it.
             source = out / run.folder / name
             if source.is_file():
                 target = out / kept
@@ -76,6 +77,7 @@ def _trajectory_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figur
             for kind in table.figures:
                 stem = f"{kind}-{folder_name(name)}-{table.name}"
                 if kind == "trajectory":
+                    # Their axes span all runs, so that the figures can be compared.
                     beside = list(trajectories.values())
                     for case, trajectory in trajectories.items():
                         drawn = trajectory_figure(trajectory, scenario, beside=beside)

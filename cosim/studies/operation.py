@@ -26,8 +26,6 @@ from learning.errors import DivergenceError
 from learning.log import LogRow
 from learning.training_run import TrainingRun, begin_training
 
-WEEK = 7 * 86400.0
-"""Seconds of a week."""
 THETA_PREFIX = "theta "
 """Of the columns of a log that hold θ."""
 WINDOW = 100

@@ -82,6 +82,7 @@ def operation_tables(
     title = "Regret in % of the run so far, exploration included, median [95 %] (worst)"
     yield f"{title}: `{scenario}`", ("case", *times), _run_rows(result.runs, marks)
 
+    # The effort is that of whole runs.
     end = result.runs[result.runs.samples == marks[-1]]
     title = f"What {times[-1]} of operation took on `{scenario}`, medians"
     header = (
@@ -90,6 +91,7 @@ def operation_tables(
     )  # fmt: skip
     yield title, header, _effort_rows(end, seconds, WEEK / layout.sampling_time)
 
+    # Where θ never moves there is no shift to compare.
     rows = _shift_rows(end)
     if rows:
         title = f"Shifts of {SHIFT} samples dearer than θ as it starts, median (worst)"
@@ -136,8 +138,8 @@ def _regret_cell(regret: Array, interval: Interval) -> str:
     """Median of the regrets (R,) of the runs in %, its interval, and the worst."""
     if not len(regret):
         return ""
-    median = _percent(float(np.median(regret)), interval)
-    worst = _percent(float(regret.max()))
+    median = _share_cell(float(np.median(regret)), interval)
+    worst = _share_cell(float(regret.max()))
     return f"{median} ({worst})"
 
 
@@ -215,13 +217,13 @@ def _difference_rows(
                 cells.append("")
                 continue
             median, interval, p = paired_difference(cost, other_cost, result.optimum[mark])
-            difference = _percent(median, interval)
+            difference = _share_cell(median, interval)
             cells.append(difference if np.isnan(p) else f"{difference}, p {p:.2f}")
         rows.append(cells)
     return rows
 
 
-def _percent(share: float, interval: Interval = None) -> str:
+def _share_cell(share: float, interval: Interval = None) -> str:
     return shown(share, interval, scale=100.0, digits=3)
 
 

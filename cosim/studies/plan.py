@@ -89,6 +89,7 @@ class Study:
     def __init__(self, table: StudyTable, folder: Path, file: str | None = None) -> None:
         self.table = table
         self.file = file
+        # Users' modules are found from here, whatever the working directory is then.
         self.folder = folder.resolve()
         import_from(self.folder)
 
@@ -129,6 +130,7 @@ class Study:
         scenarios: dict[str, Scenario] = {}
         for source in self.table.scenarios:
             path = self.folder / source if source.endswith(".toml") else source
+            # The study's own goes before a preset of the same name.
             scenario = written_here.get(source) or Scenario.load(path)
             if scenario.name in scenarios:
                 raise StudyError(
@@ -223,6 +225,7 @@ class Study:
         if case.against is None:
             return None
         names = [other.name for other in self.all_cases]
+        # The point's coordinates with their brackets.
         label = case.name[case.name.index("(") :] if "(" in case.name else ""
         for name in (case.against, f"{case.against}{label}"):
             if name in names and name != case.name:
@@ -428,6 +431,7 @@ class StudyPlan:
 
 def plan(study: Study) -> StudyPlan:
     """The runs of a study; every mistake in it is raised here, before the work."""
+    # Every FMU is opened once: one that does not load must not stop a study half way.
     plants = {}
     for name, scenario in study.scenarios.items():
         with FmuPlant(scenario) as plant:

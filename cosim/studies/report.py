@@ -59,6 +59,7 @@ def write_report(study: StudyMeasurements, figures: Mapping[str, Sequence[str]])
         # Those of a stored study's single runs are there once `cosim results draw` drew them.
         return _image(path) if path.is_file() else None
 
+    # The templates have the names of the pages.
     for name in (MARKDOWN, PAGE):
         write_atomically(study.folder / name, rendered(name, **content, picture=picture))
     return study.folder / PAGE
@@ -69,6 +70,7 @@ def rendered(template: str, **context: Any) -> str:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=select_autoescape(["html"]),
+        # A line with a tag alone leaves no blank line, which would end a Markdown table.
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
@@ -139,6 +141,7 @@ def _made_with(provenance: Mapping[str, Any]) -> str:
 def _image(path: Path) -> dict[str, str]:
     """An SVG file as an `img`'s source, and its width in CSS pixels."""
     content = path.read_bytes()
+    # Within the page, which then needs no other file.
     encoded = base64.b64encode(content).decode()
     width = re.search(rb'width="([\d.]+)pt"', content)
     return {

@@ -64,11 +64,13 @@ class StudyResults(StudyMeasurements, Shown):
             stores: what is there of each run.
             draw: whether the kept trajectories and logs are drawn.
         """
+        # First: figures are drawn from the copies, so that a stored study draws the same.
         keep_files(plan, out)
         tables = measured_tables(plan, stores)
         about = document(plan)
         about["pictures"] = draw_kept(plan, out) if draw else []
         results = cls(out, about, *(tables[name] for name in RAW_TABLES))
+        # Of a study without operation these tables have no rows.
         if not results.scenarios_in_operation:
             del tables[OPERATION]
             del tables[GREEDY]
@@ -210,12 +212,14 @@ def study(
     definition = source if isinstance(source, Study) else Study.load(source)
     folder = Path(out)
     planned = planned or plan(definition)
+    # Two processes in one folder would give out the same work twice.
     with holding(folder), reporting(progress, definition.name, planned.samples) as tell:
         runner = Runner(planned.runs, folder, tell)
         for line in runner.remarks:
             tell(0, "", line)
         runner.run(jobs, scheduler)
         results = StudyResults.write(planned, folder, runner.stores.values(), draw=figures)
+    # Raised at the end: a failed run must not cost the others' results.
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
         more = len(runner.failures) - 1

@@ -301,6 +301,7 @@ class TrainItem(Item[Trained]):
         training = self.training
         with temporary_folder("cosim-training-") as folder:
             if training.theta is not None:
+                # As text in the job, so that the worker needs no file of the study.
                 start = folder / "start.toml"
                 start.write_text(training.theta, "utf-8")
                 options = replace(training.options, start=str(start))
@@ -370,6 +371,7 @@ class RunStore:
         self._quiet_until = 0.0
         if not self.folder.resolve().is_relative_to(out.resolve()):
             raise StudyError(f"'{self.folder}' leads out of '{out}'; choose another --out")
+        # Of an attempt before this one.
         (self.folder / FAILURE).unlink(missing_ok=True)
         self.about = self._intact_run_file()
         if self._is_of_other_facts():
@@ -517,6 +519,7 @@ class RunStore:
         if run.training is not None:
             if not self.status:
                 self._unseal()
+                # A worker without this disk has its checkpoint in a folder of its own.
                 folder = self.folder.absolute() if shared_disk else None
                 yield TRAINING, TrainItem(run.conditions, run.training, folder)
                 return
@@ -561,6 +564,7 @@ class RunStore:
             "wall_seconds": result.wall_seconds,
             "processor_seconds": dict(result.processor_seconds),
         }
+        # Last, with the hashes: a training that is interrupted before this is done again.
         self._note(
             status=result.status,
             samples=result.samples,
@@ -695,6 +699,7 @@ class Runner:
                     else:
                         self._store(key, items[key], result)
         finally:
+            # After an interruption, too: what was measured is not measured again.
             for store in self.stores.values():
                 store.flush()
 
@@ -706,6 +711,7 @@ class Runner:
                 continue
             for number, (file, item) in enumerate(store.items(shared_disk)):
                 items[WorkKey(name, file, number)] = item
+            # A run that lacks nothing is complete without an item.
             store.seal()
         self._tell("")
         return items

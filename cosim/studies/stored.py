@@ -112,6 +112,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
             continue
         (fresh / relative).parent.mkdir(parents=True, exist_ok=True)
         write_atomically(fresh / relative, content)
+    # Written beside and moved at the end: an interruption leaves the files that were stored.
     shutil.rmtree(target, ignore_errors=True)
     fresh.replace(target)
     return left_out
@@ -269,6 +270,7 @@ def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
             # A column is called `NAME [UNIT]`, or by its name alone.
             name, _, unit = title.partition(" [")
             units[name] = unit.removesuffix("]")
+            # A table that was just computed has more digits than a stored one.
             cells = [_rounded_cell(cell) for cell in texts[title]]
             if name in keys or name in WORD_COLUMNS:
                 columns[name] = cells
@@ -315,7 +317,7 @@ def _table_differences(
     ):
         rows = table.index.difference(other.index, sort=False)
         if len(rows):
-            lines.append(f"{name}: row {_row(table, rows[0])} is {rows_are}")
+            lines.append(f"{name}: row {_keys_of_row(table, rows[0])} is {rows_are}")
         columns = table.columns.difference(other.columns, sort=False)
         if len(columns):
             lone_columns.append(f"{name}: signal {', '.join(columns)} is {columns_are}")
@@ -336,7 +338,7 @@ def _table_differences(
             continue
         first = int(np.argmax(differs))
         text = (
-            f"{name}: row {_row(stored, common_rows[first])}: signal {signal} is "
+            f"{name}: row {_keys_of_row(stored, common_rows[first])}: signal {signal} is "
             f"{after.tolist()[first]!r} now, {before.tolist()[first]!r} stored"
         )
         if tolerance is not None:
@@ -372,7 +374,7 @@ def _tolerance_of(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -
     return tolerance
 
 
-def _row(table: pd.DataFrame, row: object) -> str:
+def _keys_of_row(table: pd.DataFrame, row: object) -> str:
     """The keys of a row of a table, in words."""
     values = row if isinstance(row, tuple) else (row,)
     pairs = zip(table.index.names, values, strict=True)

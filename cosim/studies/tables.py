@@ -73,6 +73,7 @@ def _finished(plan: StudyPlan, stores: Iterable[RunStore]) -> list[RunStore]:
     order = list(product(plan.definition.scenarios, cases))
     positions = {where: position for position, where in enumerate(order)}
     finished = [store for store in stores if store.complete]
+    # The sort is stable: runs of one case stay in the order of their seeds.
     finished.sort(key=lambda store: positions[store.run.scenario.name, store.run.case])
     return finished
 

@@ -49,10 +49,11 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
         axes = drawn.subplots()
         for case, values in samples.items():
             color = styles[case].color
+            # Not by `density=True`, which would leave out the samples outside of the bins.
             counts, _ = np.histogram(values, edges)
             density = counts / (len(values) * width)
-            share_below = np.mean(bound - values > VIOLATING)
-            label = f"{shown_case(case)}: {100 * share_below:.1f} % below"
+            violates = bound - values > VIOLATING
+            label = f"{shown_case(case)}: {100 * np.mean(violates):.1f} % below"
             axes.stairs(density, edges, fill=True, alpha=0.12, color=color)
             axes.stairs(density, edges, color=color, linewidth=1.2, label=label)
         axes.axvline(bound, color=BOUND, linewidth=1.1, linestyle=DASHED, label="bound")
@@ -125,10 +126,8 @@ def phase_figure(
     longest = _longest_arrow(list(fields.values()))
     # Policies that stay at the operating point have no arrows to scale.
     arrow_scale = longest or 1.0
-    # The axes reach half a cell beyond the outermost arrows.
-    half_x = 0.5 * (x[1] - x[0])
-    half_y = 0.5 * (y[1] - y[0])
-    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    left, right = _limits_of_cells(x)
+    bottom, top = _limits_of_cells(y)
     columns = 2 if len(runs) == 4 else min(len(runs), 3)
     rows = -(-len(runs) // columns)
     height = 7.0 / columns * rows + 0.4
@@ -138,13 +137,13 @@ def phase_figure(
         for axes in grid.flat[len(runs) :]:
             axes.set_visible(False)
         for axes, (case, run) in zip(grid.flat, runs.items(), strict=False):
-            _draw_density(axes, run.states[:, :2], extent)
+            _draw_density(axes, run.states[:, :2], (left, right, bottom, top))
             _draw_arrows(axes, x, y, fields[case] / arrow_scale)
             _draw_operating_point(axes, scenario)
             _draw_bounds(axes, scenario)
             axes.set_title(shown_case(case))
-            axes.set_xlim(extent[:2])
-            axes.set_ylim(extent[2:])
+            axes.set_xlim(left, right)
+            axes.set_ylim(bottom, top)
         first_state, second_state = scenario.plant.states[:2]
         for axes in grid[-1]:
             axes.set_xlabel(style.label(first_state, _unit(runs, first_state)))
@@ -161,6 +160,12 @@ def _grid_of_states(runs: Sequence[Trajectory]) -> tuple[Array, Array]:
     x = np.linspace(low[0], high[0], GRID)
     y = np.linspace(low[1], high[1], GRID)
     return x, y
+
+
+def _limits_of_cells(points: Array) -> tuple[float, float]:
+    """Limits of an axis that reaches half a cell beyond the outermost points, where arrows end."""
+    half = 0.5 * float(points[1] - points[0])
+    return float(points[0]) - half, float(points[-1]) + half
 
 
 def _caption(scenario: Scenario, longest: float) -> str:

@@ -154,11 +154,13 @@ def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Li
     """
     endings = [f"-{scenario}" for scenario in scenarios]
     rules = {name: _rule(name, endings) for name in names}
-    others = cycle(_OTHERS)
+    other_colors = cycle(_OTHERS)
     colors: dict[str, str] = {}
     for rule in rules.values():
-        if rule not in colors:
-            colors[rule] = _KNOWN.get(rule) or next(others)
+        if rule in _KNOWN:
+            colors[rule] = _KNOWN[rule]
+        elif rule not in colors:
+            colors[rule] = next(other_colors)
     n_lines: Counter[str] = Counter()
     styles = {}
     for name, rule in rules.items():
@@ -197,13 +199,17 @@ def plain(text: str) -> str:
 
 def shown_case(name: str) -> str:
     """A case's name as figures set it: `q-learning, naive` for `q-learning(start=naive)`."""
-    head, _, settings = name.removesuffix(")").partition("(")
-    if settings and "=" not in settings:  # a controller
+    rule, _, settings = name.removesuffix(")").partition("(")
+    # A controller of a list, `name(controller)`, has no settings.
+    if settings and "=" not in settings:
         return plain(name)
-    parts = [head]
+    parts = [rule]
     for setting in settings.split():
-        parts.append(setting.removeprefix("start=").replace("=", " "))
-    return plain(", ".join(parts).replace("_", " "))
+        # Where θ starts is told by its name alone.
+        text = setting.removeprefix("start=")
+        parts.append(text.replace("=", " "))
+    shown_name = ", ".join(parts)
+    return plain(shown_name.replace("_", " "))
 
 
 def symbol(name: str) -> str:

@@ -129,26 +129,47 @@ def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
     """
     rows = study.curves[study.curves.scenario == scenario]
     is_training = rows.training_seed.notna()
-    controllers = rows[~is_training].set_index("case").greedy_J
     trained = rows[is_training]
+    # Baselines that are trained, too, are lines at the cost that they end with.
     learned = trained[~trained.case.isin(study.baselines)]
-    greedy = trained.dropna(subset="greedy_J").groupby(RUN_KEYS).greedy_J
+    evaluated = trained.dropna(subset="greedy_J")
+    greedy = evaluated.groupby(RUN_KEYS).greedy_J
     has_course = (greedy.size() > 1).any()
     if learned.empty or not has_course:
         return None
-    optimal_cost = float(controllers.get(study.about["optimum"].get(scenario), np.nan))
-    best = optimal_cost if np.isfinite(optimal_cost) else None
+    controllers = rows[~is_training].set_index("case").greedy_J
+    at_the_end = greedy.last().groupby("case").median()
+    levels = _levels(study, scenario, pd.concat([controllers, at_the_end]))
+    best = _optimal_cost(study, scenario, controllers)
+    if best is not None:
+        levels[:] = 100 * regrets(levels.to_numpy(), best)
     curves = {}
     for case, log in learned.groupby("case", sort=False):
         curves[str(case)] = learning_curve(log, best)
-    at_the_end = greedy.last().groupby("case").median()
-    levels = _levels(study, scenario, pd.concat([controllers, at_the_end]))
-    if best is not None:
-        levels[:] = 100 * regrets(levels.to_numpy(), best)
-    return curves_figure(curves, levels.to_dict(), _styles(study), relative=best is not None)
+    return curves_figure(
+        curves,
+        levels.to_dict(),
+        _styles(study),
+        relative=best is not None,
+    )
 
 
-def _levels(study: StudyMeasurements, scenario: str, costs: pd.Series) -> pd.Series:
+def _optimal_cost(
+    study: StudyMeasurements, scenario: str, controllers: pd.Series[float]
+) -> float | None:
+    """J* on the noise of the curves; None where it is not known.
+
+    Args:
+        study: the measurements.
+        scenario: its name.
+        controllers: greedy cost of each controller, by case.
+    """
+    optimum = study.about["optimum"].get(scenario)
+    cost = float(controllers.get(optimum, np.nan))
+    return cost if np.isfinite(cost) else None
+
+
+def _levels(study: StudyMeasurements, scenario: str, costs: pd.Series[float]) -> pd.Series[float]:
     """Greedy costs of the baselines that a figure of curves shows as lines.
 
     Args:
@@ -179,9 +200,8 @@ def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
     # A run that diverged has fewer points: those that did not set the axis.
     longest = max(runs, key=lambda points: points.shape[1])
     samples = longest[0]
-    n_points = len(samples)
-    training = np.array([_padded(points[1], n_points) for points in runs])
-    greedy = np.array([_padded(points[2], n_points) for points in runs])
+    padded = [_padded(points, len(samples)) for points in runs]
+    _, training, greedy = np.stack(padded, axis=1)
     if best is not None:
         training = 100 * regrets(training, best)
         greedy = 100 * regrets(greedy, best)
@@ -201,8 +221,9 @@ def _points_of_a_run(log: pd.DataFrame) -> Array:
 
 
 def _padded(values: Array, length: int) -> Array:
-    """Values followed by the last of them, (length,)."""
-    return np.pad(values, (0, length - len(values)), mode="edge")
+    """Rows of values (3, K), each followed by its last one, (3, length)."""
+    n_missing = length - values.shape[1]
+    return np.pad(values, ((0, 0), (0, n_missing)), mode="edge")
 
 
 def curves_figure(

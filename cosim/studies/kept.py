@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -149,10 +148,7 @@ def increments(log: pd.DataFrame) -> dict[str, Array]:
     """θ less its first row by block, (K, entries), of a training's log of K rows."""
     theta = log.filter(like=THETA_PREFIX).astype(float)
     changes = theta - theta.iloc[0]
-    entries: dict[str, list[Array]] = {}
-    for column in changes:
-        # A column is called `theta BLOCK[i,j]`.
-        entry = str(column).removeprefix(THETA_PREFIX)
-        block, _, _ = entry.partition("[")
-        entries.setdefault(block, []).append(changes[column].to_numpy())
-    return {block: np.column_stack(columns) for block, columns in entries.items()}
+    # A column is called `theta BLOCK[i,j]`.
+    entries = changes.columns.str.removeprefix(THETA_PREFIX)
+    blocks = entries.str.split("[").str[0]
+    return {block: changes.loc[:, blocks == block].to_numpy() for block in blocks.unique()}

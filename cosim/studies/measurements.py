@@ -245,15 +245,17 @@ class StudyMeasurements:
     def _statistics_of_run(self, case: str, scenario: str, run: int) -> dict[str, Any]:
         """Columns of `runs` that are measured, of the run with a number."""
         indicators = self.indicators[scenario, case]
-        row: dict[str, Any] = {}
-        for name in ("J", *AGGREGATED_MEANS):
+        cost = float(indicators["J"][run].mean())
+        regret = self.regret(case, scenario, [run])
+        row: dict[str, Any] = {
+            # The mean cost of a run that diverged may be NaN.
+            "J": cost if np.isfinite(cost) else np.inf,
+            **columns_of("regret", regret),
+            "gap_closed": self.gap_closed(case, scenario, [run]).value,
+            "failures": int(indicators["failures"][run].sum()),
+        }
+        for name in AGGREGATED_MEANS:
             row[name] = float(indicators[name][run].mean())
-        # The mean cost of a run that diverged may be NaN.
-        if not np.isfinite(row["J"]):
-            row["J"] = np.inf
-        row.update(columns_of("regret", self.regret(case, scenario, [run])))
-        row["gap_closed"] = self.gap_closed(case, scenario, [run]).value
-        row["failures"] = int(indicators["failures"][run].sum())
         return row
 
     @cached_property
@@ -264,10 +266,14 @@ class StudyMeasurements:
         """
         rows: list[dict[str, Any]] = []
         for scenario in self.scenarios:
-            measured = [case for case in self.cases if len(self.indicator(case, scenario))]
-            rows_here = [self._summary_row(case, scenario) for case in measured]
+            rows_here = []
+            for case in self.cases:
+                # Of a case that has not run, or not here, there is no row.
+                if len(self.indicator(case, scenario)):
+                    rows_here.append(self._summary_row(case, scenario))
             rows_here.sort(key=lambda row: float(row["J_median"]))
-            ranks = self._ranks(scenario, [row["case"] for row in rows_here])
+            by_cost = [row["case"] for row in rows_here]
+            ranks = self._ranks(scenario, by_cost)
             for row in rows_here:
                 row["rank"] = ranks[row["case"]]
             rows += rows_here
@@ -361,11 +367,15 @@ class StudyMeasurements:
 
         The bootstrap is stratified: runs are resampled within their scenario.
         """
-        scenarios = [name for name in self.scenarios if self.reference("optimum", name) is not None]
+        scenarios = []
+        for name in self.scenarios:
+            if self.reference("optimum", name) is not None:
+                scenarios.append(name)
         rows = []
         for case in self.cases:
             strata = [self.regrets(case, scenario) for scenario in scenarios]
             ran_on_all = all(len(regrets) for regrets in strata)
+            # Of one scenario the summary says the same.
             if len(strata) > 1 and ran_on_all:
                 rows.append({"case": case, **_aggregate_columns(strata)})
         rows.sort(key=lambda row: float(row["regret_iqm"]))

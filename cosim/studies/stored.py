@@ -293,11 +293,11 @@ def _theta_table(path: Path) -> pd.DataFrame:
     blocks: Mapping[str, object] = document.get("theta", {})
     for block, values in blocks.items():
         array = np.asarray(values, dtype=np.float64)
-        for index in np.ndindex(array.shape):
+        for index, value in np.ndenumerate(array):
             # A block that is one number has no index.
             numbers = ",".join(str(number) for number in index)
-            place = f"[{numbers}]" if index else ""
-            row[f"theta {block}{place}"] = repr(float(array[index]))
+            entry = f"{block}[{numbers}]" if index else block
+            row[f"theta {entry}"] = repr(float(value))
     return pd.DataFrame([row])
 
 

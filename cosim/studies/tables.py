@@ -70,7 +70,7 @@ def measured_tables(plan: StudyPlan, stores: Iterable[RunStore]) -> dict[str, pd
 def _finished(plan: StudyPlan, stores: Iterable[RunStore]) -> list[RunStore]:
     """The finished runs by scenario and case, in the order of the study."""
     cases = [case.name for case in plan.definition.all_cases]
-    order = list(product(plan.definition.scenarios, cases))
+    order = product(plan.definition.scenarios, cases)
     positions = {where: position for position, where in enumerate(order)}
     finished = [store for store in stores if store.complete]
     # The sort is stable: runs of one case stay in the order of their seeds.

@@ -34,7 +34,10 @@ SEED_FLOOR = 0.1
 
 
 def evaluation_figure(
-    controllers: Mapping[str, pd.DataFrame], *, title: str, optimal: Array | None = None
+    controllers: Mapping[str, pd.DataFrame],
+    *,
+    title: str,
+    optimal: Array | None = None,
 ) -> Figure:
     """Left: J of each controller; right: economic cost against violation.
 
@@ -99,7 +102,9 @@ def _dots(name: str, values: Array, estimate: Estimate, scale: float = 1.0) -> D
 
 
 def _draw_pareto(
-    axes: Axes, controllers: Mapping[str, pd.DataFrame], styles: Mapping[str, LineStyle]
+    axes: Axes,
+    controllers: Mapping[str, pd.DataFrame],
+    styles: Mapping[str, LineStyle],
 ) -> None:
     """Economic cost against violation of each controller, and the line of the best of both."""
     means = {}

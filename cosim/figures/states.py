@@ -107,7 +107,9 @@ def _common_bins(samples: Sequence[Array], bound: float) -> tuple[Array, float]:
 
 
 def phase_figure(
-    runs: Mapping[str, Trajectory], policies: Mapping[str, Policy], scenario: Scenario
+    runs: Mapping[str, Trajectory],
+    policies: Mapping[str, Policy],
+    scenario: Scenario,
 ) -> Figure:
     """Phase portraits, a panel for each controller: where the state lives, and its policy there.
 

@@ -113,7 +113,9 @@ def save(drawn: Figure, path: str | Path) -> Path:
 
 
 def save_set(
-    figures: Iterable[tuple[str, Figure]], folder: Path, formats: Sequence[str] = FORMATS
+    figures: Iterable[tuple[str, Figure]],
+    folder: Path,
+    formats: Sequence[str] = FORMATS,
 ) -> list[str]:
     """Write named figures into a folder.
 

@@ -156,7 +156,11 @@ def _draw_cost(
 
 
 def _draw_course(
-    axes: Axes, samples: Array, values: Array, color: str, least: float
+    axes: Axes,
+    samples: Array,
+    values: Array,
+    color: str,
+    least: float,
 ) -> Sequence[EndLabel]:
     """A line from 0 to `least` or more, logarithmic where it spans decades; it has no name."""
     marker = "." if len(values) < POINTS else ""

@@ -39,7 +39,10 @@ DrawnRun = Any
 
 
 def trajectory_figure(
-    trajectory: DrawnRun, scenario: Scenario, *, beside: Sequence[DrawnRun] = ()
+    trajectory: DrawnRun,
+    scenario: Scenario,
+    *,
+    beside: Sequence[DrawnRun] = (),
 ) -> Figure:
     """States and inputs with bounds (red) and operating point (grey), disturbances and costs.
 
@@ -107,7 +110,10 @@ def _span(axes: Axes, time: float, values: Array) -> None:
 
 
 def _loop_panels(
-    panels: Mapping[str, Axes], time: Array, trajectory: DrawnRun, scenario: Scenario
+    panels: Mapping[str, Axes],
+    time: Array,
+    trajectory: DrawnRun,
+    scenario: Scenario,
 ) -> None:
     """Draw states and inputs, their bounds and operating point, and fallback actions."""
     controller = trajectory.controller or "run"
@@ -213,7 +219,9 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
 
 
 def _draw_costs_legend(
-    axes: Axes, runs: Mapping[str, DrawnRun], styles: Mapping[str, LineStyle]
+    axes: Axes,
+    runs: Mapping[str, DrawnRun],
+    styles: Mapping[str, LineStyle],
 ) -> None:
     """Name each controller above the axes, with its J and the share of violating samples."""
     for controller, run in runs.items():
@@ -229,7 +237,11 @@ def _draw_costs_legend(
 
 
 def animation(
-    start: str, first: DrawnRun, name: str, runs: Mapping[str, DrawnRun], path: str | Path
+    start: str,
+    first: DrawnRun,
+    name: str,
+    runs: Mapping[str, DrawnRun],
+    path: str | Path,
 ) -> Path:
     """Write a GIF: a frame for each run, drawn over the first one on the same axes.
 
@@ -287,7 +299,11 @@ def _fix_ordinate(axes: Axes, values: Array) -> None:
 
 
 def episode_image(
-    scenario: Scenario, units: dict[str, str], first: int, states: Array, actions: Array
+    scenario: Scenario,
+    units: dict[str, str],
+    first: int,
+    states: Array,
+    actions: Array,
 ) -> NDArray[np.uint8]:
     """An RGB image of an episode's last samples.
 
@@ -345,7 +361,13 @@ def time_unit(time: Array) -> tuple[float, str]:
 
 
 def _line(
-    axes: Axes, time: Array, run: DrawnRun, name: str, color: str, width: float, shade: str
+    axes: Axes,
+    time: Array,
+    run: DrawnRun,
+    name: str,
+    color: str,
+    width: float,
+    shade: str,
 ) -> None:
     """Draw a state, or an input, which is held, and shade what is beyond its bounds."""
     values = run[name]

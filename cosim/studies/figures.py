@@ -155,7 +155,9 @@ def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
 
 
 def _optimal_cost(
-    study: StudyMeasurements, scenario: str, controllers: pd.Series[float]
+    study: StudyMeasurements,
+    scenario: str,
+    controllers: pd.Series[float],
 ) -> float | None:
     """J* on the noise of the curves; None where it is not known.
 

@@ -144,7 +144,9 @@ def _regret_cell(regret: Array, interval: Interval) -> str:
 
 
 def _effort_rows(
-    end: pd.DataFrame, seconds: Mapping[str, float], samples_per_week: float
+    end: pd.DataFrame,
+    seconds: Mapping[str, float],
+    samples_per_week: float,
 ) -> list[list[str]]:
     """What each case's median run took.
 
@@ -199,7 +201,9 @@ def _shift_rows(end: pd.DataFrame) -> list[list[str]]:
 
 
 def _difference_rows(
-    result: OperationResult, marks: Sequence[int], against: Mapping[str, str | None]
+    result: OperationResult,
+    marks: Sequence[int],
+    against: Mapping[str, str | None],
 ) -> list[list[str]]:
     """Regret of a case less that of its counterpart, at each mark."""
     rows = []

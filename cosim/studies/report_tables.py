@@ -54,7 +54,9 @@ NEAR = 3.0
 
 
 def scenario_table(
-    study: StudyMeasurements, scenario: str, columns: Sequence[str] | None = None
+    study: StudyMeasurements,
+    scenario: str,
+    columns: Sequence[str] | None = None,
 ) -> TitledRows:
     """The table of a scenario, lowest J first.
 
@@ -229,7 +231,9 @@ def paper_table(study: StudyMeasurements) -> TextTable:
 
 
 def _gains_over_baselines(
-    indicators: Mapping[str, Array], naive: Mapping[str, Array], tuned: Mapping[str, Array]
+    indicators: Mapping[str, Array],
+    naive: Mapping[str, Array],
+    tuned: Mapping[str, Array],
 ) -> list[str]:
     """Cells of the paper's table: what a case's median run gains over (a) and (b).
 
@@ -269,7 +273,12 @@ def _percent(row: Mapping[str, Any], name: str, *, interval: str = "", digits: i
 
 
 def _estimate(
-    row: Mapping[str, Any], name: str, *, interval: str = "", scale: float = 1.0, digits: int = 3
+    row: Mapping[str, Any],
+    name: str,
+    *,
+    interval: str = "",
+    scale: float = 1.0,
+    digits: int = 3,
 ) -> str:
     """A number with its interval, if any; empty if undefined; arguments as of `_percent`."""
     value = float(row[name])

@@ -54,7 +54,12 @@ class StudyResults(StudyMeasurements, Shown):
 
     @classmethod
     def write(
-        cls, plan: StudyPlan, out: Path, stores: Iterable[RunStore], *, draw: bool = True
+        cls,
+        plan: StudyPlan,
+        out: Path,
+        stores: Iterable[RunStore],
+        *,
+        draw: bool = True,
     ) -> StudyResults:
         """Write the tables and kept files of a plan's finished runs, study.json last.
 

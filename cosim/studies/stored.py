@@ -213,7 +213,10 @@ def compared_tables(folder: Path) -> dict[str, list[str]]:
 
 
 def table_differences(
-    name: str, stored: Path, now: Path, tolerances: Mapping[str, Tolerance]
+    name: str,
+    stored: Path,
+    now: Path,
+    tolerances: Mapping[str, Tolerance],
 ) -> list[str]:
     """Differences of a stored study from the same computed now, in words.
 
@@ -302,7 +305,10 @@ def _theta_table(path: Path) -> pd.DataFrame:
 
 
 def _table_differences(
-    name: str, stored: pd.DataFrame, now: pd.DataFrame, tolerances: Mapping[str, Tolerance]
+    name: str,
+    stored: pd.DataFrame,
+    now: pd.DataFrame,
+    tolerances: Mapping[str, Tolerance],
 ) -> list[str]:
     """Differences of two tables in words.
 

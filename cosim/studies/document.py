@@ -19,6 +19,8 @@ Source = Annotated[str, Field(min_length=1)]
 PerScenario = RunCount | dict[str, RunCount]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""
 DEFAULT = "default"
+FOR_ALGORITHMS = {"samples", "start", "nmpc", "settings", "training", "training_seeds"}
+"""Fields of a case that a controller has no use for."""
 Hour = Annotated[float, Field(gt=0.0, le=1e6)]
 Hours = Annotated[list[Hour], Field(min_length=1)]
 
@@ -114,12 +116,11 @@ class CaseTable(Table):
             raise ValueError(f"{self._where()}: needs either algorithm or controller")
         if self.algorithm is not None and self.name is None:
             raise ValueError(f"{self._where()}: a case with an algorithm needs a name")
-        if self.controller is not None and (
-            set_there := self.model_fields_set
-            & {"samples", "start", "nmpc", "settings", "training", "training_seeds"}
-        ):
+        # Their defaults are harmless beside a controller; what is written has no effect.
+        set_in_vain = self.model_fields_set & FOR_ALGORITHMS
+        if self.controller is not None and set_in_vain:
             raise ValueError(
-                f"{self._where()}: {', '.join(sorted(set_there))} is for an algorithm; a "
+                f"{self._where()}: {', '.join(sorted(set_in_vain))} is for an algorithm; a "
                 "controller is evaluated without training"
             )
         return self

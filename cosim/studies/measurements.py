@@ -354,6 +354,9 @@ class StudyMeasurements:
 
         def is_worse(case: str, leader: str) -> bool:
             cost, leader_cost = self._pairs(case, leader, scenario)
+            # Without a training seed in common nothing is known.
+            if not cost.size:
+                return False
             # Without J* the leader's cost is the unit of the difference, whose sign counts.
             unit = leader_cost.mean(axis=0) if best is None else best
             return costs_more(cost, leader_cost, unit)

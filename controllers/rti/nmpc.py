@@ -784,6 +784,12 @@ class RtiNmpc:
         self._x = prepare.part("x").reshape(horizon, -1)
         self._u = prepare.part("u").reshape(horizon, -1)
         self._costates = prepare.part("costates").reshape(horizon, -1)
+        # The values of each varying quantity at the stages 0 … N, which stand behind θ.
+        behind = prepare.inputs["theta"][self._functions.blocks.size :]
+        sigma = behind.reshape(horizon + 1, len(problem.varying))
+        self._signal_columns = [
+            (item.signal, sigma[:, row]) for row, item in enumerate(problem.varying)
+        ]
         self._constant = prepare.part("constant")
 
         # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
@@ -881,26 +887,25 @@ class RtiNmpc:
         Raises:
             ControllerError: A signal of the problem is not among them, or has no finite values.
         """
-        problem = self.problem
-        if not problem.varying:
+        if not self._signal_columns:
             return
-        sigma = np.empty((problem.horizon + 1, len(problem.varying)))
-        for row, item in enumerate(problem.varying):
-            if item.signal not in known:
-                raise ControllerError(f"nothing is known of the problem's signal '{item.signal}'")
-            values = np.asarray(known[item.signal], dtype=np.float64)
-            if values.ndim != 1 or not values.size or not np.isfinite(values).all():
+        n_stages = self.problem.horizon + 1
+        for signal, column in self._signal_columns:
+            values = known.get(signal)
+            if values is None:
+                raise ControllerError(f"nothing is known of the problem's signal '{signal}'")
+            # What is read-only is the scenario's own, which was checked when it was read.
+            if values.flags.writeable and not _are_finite(values):
                 raise ControllerError(
-                    f"signal '{item.signal}' must be known by finite values, its present one first"
+                    f"signal '{signal}' must be known by finite values, its present one first"
                 )
-            count = min(values.size, len(sigma))
-            sigma[:count, row] = values[:count]
-            sigma[count:, row] = values[-1]
-        behind = self._prepare.inputs["theta"][self._parameters.blocks.size :]
-        new = sigma.reshape(-1)
-        if not np.array_equal(behind, new):
-            behind[:] = new
-            self._prepared = None
+            n_known = len(values)
+            if n_known >= n_stages:
+                column[:] = values[:n_stages]
+            else:
+                column[:n_known] = values
+                column[n_known:] = values[-1]
+        self._prepared = None
 
     # the two phases -----------------------------------------------------------------------------
 
@@ -1414,6 +1419,11 @@ def _batch_rows(
     if rows.shape not in (shape, batch_shape):
         raise ControllerError(f"the {kind} must have shape {batch_shape}, not {rows.shape}")
     return np.ascontiguousarray(np.broadcast_to(rows, batch_shape))
+
+
+def _are_finite(values: Vector) -> bool:
+    """Whether values are at least one finite number, in a row."""
+    return values.ndim == 1 and values.size > 0 and bool(np.isfinite(values).all())
 
 
 def _vector(kind: str, values: ArrayLike, size: int) -> Vector:

@@ -34,6 +34,8 @@ class Signals:
         self._scenario = scenario
         self._h = scenario.sampling_time
         self._times = [_times(table) for table in self.tables]
+        # Values at the first samples, so far as they have been asked for.
+        self._at_samples: list[Array] = [np.empty(0) for _ in self.tables]
         self._bounds = [i for i, table in enumerate(self.tables) if table.bound is not None]
         self._penalties: dict[tuple[float, ...], Penalty] = {}
 
@@ -117,9 +119,23 @@ class Signals:
         for i, table in enumerate(self.tables):
             if table.known == "none":
                 continue
-            coming = range(k, k + self.ahead(i) + 1)
-            known[table.name] = np.array([self.value(i, j) for j in coming])
+            known[table.name] = self._part(i, k, k + self.ahead(i) + 1)
         return known
+
+    def _part(self, i: int, first: int, end: int) -> Array:
+        """Values of signal i at the samples `first` to `end`, without this one, read-only."""
+        values = self._at_samples[i]
+        if len(values) < end:
+            # Twice as many each time; beyond its end it has none.
+            more = [self.value(i, k) for k in range(len(values), end)]
+            for k in range(end, 2 * end):
+                if not self._lasts_to(i, k):
+                    break
+                more.append(self.value(i, k))
+            values = np.concatenate([values, more])
+            values.flags.writeable = False
+            self._at_samples[i] = values
+        return values[first:end]
 
     def penalty(self, k: int) -> Penalty:
         """Penalty of a state by the bounds at sample k."""

@@ -249,7 +249,8 @@ def _reading(task: Scenario, archive: UnpackedFmu, model: Model) -> tuple[Scenar
     plant.pop("model", None)
     document["plant"] = plant
     document["disturbance"] = {"law": "none"}
-    document.pop("sensors", None)
+    for key in ("sensor", "estimator", "signal"):
+        document.pop(key, None)
     return Scenario.from_dict(document), remarks
 
 

@@ -104,7 +104,7 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("disturbances", group="disturbances", vector="plant.disturbances"),
     SignalKind("measurements", group="sensors", vector="measurement_names"),
     SignalKind("estimates", group="sensors", vector="estimate_names"),
-    SignalKind("signals", _signals, group="unseen", vector="signal_names"),
+    SignalKind("signals", _signals, group="sensors", vector="signal_names"),
     SignalKind("stage_cost", unit=COST, group="costs"),
     SignalKind("penalty", _penalty, COST, "costs"),
     SignalKind("violation", _violation),

@@ -123,7 +123,11 @@ def _loop_panels(
     for name, reference in zip(scenario.limits, operating_point, strict=True):
         axes = panels[name]
         _line(axes, time, trajectory, name, color, width=0.9, shade=BOUND)
-        _limits(axes, *scenario.limits[name])
+        moving = _moving_bounds(trajectory, name)
+        for values in moving.values():
+            axes.step(time, values, where="post", color=BOUND, linewidth=1.0, linestyle=DASHED)
+        if not moving:
+            _limits(axes, *scenario.limits[name])
         axes.axhline(reference, color=REFERENCE, linewidth=0.7)
         _draw_known(axes, time, trajectory, name)
         if name in scenario.plant.actions and failed.any():
@@ -371,7 +375,12 @@ def _line(
 ) -> None:
     """Draw a state, or an input, which is held, and shade what is beyond its bounds."""
     values = run[name]
+    lower: Any
+    upper: Any
     lower, upper = run.scenario.limits[name]
+    moving = _moving_bounds(run, name)
+    lower = moving.get("x_l", lower)
+    upper = moving.get("x_u", upper)
     is_held = name in run.scenario.plant.actions
     axes.plot(
         time,
@@ -393,6 +402,15 @@ def _line(
             linewidth=0,
             interpolate=True,
         )
+
+
+def _moving_bounds(run: DrawnRun, name: str) -> dict[str, Array]:
+    """Bounds of a state that a signal moves along a run, (K,), by `x_l` and `x_u`."""
+    moving = {}
+    for signal in run.scenario.signals or ():
+        if signal.bounded_state == name and signal.bound is not None:
+            moving[signal.bound[:3]] = run[f"signal[{signal.name}]"]
+    return moving
 
 
 def _limits(axes: Axes, lower: float, upper: float) -> None:

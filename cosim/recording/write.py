@@ -50,7 +50,7 @@ Range = tuple[float, float]
 
 ALONE = ("states", "actions", "sensors", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
-HELD = ("actions", "disturbances")
+HELD = ("actions", "disturbances", "signals")
 FREE = (-inf, inf)
 _STATUS_ENTITY = "solver/status"
 _RESIDUAL = "solver/log_residual"
@@ -106,6 +106,10 @@ class RerunRecorder:
             self._fine.append(replace(channel, entity=entity, color=color, labels=["within"]))
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
         self._status: str | None = None
+        # Of each signal the state whose bound it is; empty where it is none.
+        self._bounded_by = {}
+        for signal, title in zip(scenario.signals or (), scenario.signal_names, strict=True):
+            self._bounded_by[title] = signal.bounded_state
         properties = {
             "scenario": scenario.name,
             "scenario_hash": scenario.hash,
@@ -263,6 +267,10 @@ class RerunRecorder:
         along = axis(AT(seconds=0.0), AT(seconds=self._seconds))
         left = [self._loop_view(channel, along) for channel in self._group("states", "actions")]
         middle: list[rrb.View] = []
+        for sensor in self._group("sensors"):
+            # A signal that is no bound of a state has a view of its own.
+            if self._bounded_by.get(sensor.name) == "":
+                middle.append(view(sensor.title, [sensor], along))
         for channel in self._group("costs"):
             middle.append(view(channel.title, [channel], along))
         middle.append(view("disturbances", self._group("disturbances"), along))
@@ -292,7 +300,9 @@ class RerunRecorder:
         # What is measured and estimated of a state is drawn over it.
         known = (f"measured[{channel.name}]", f"estimated[{channel.name}]")
         for sensor in self._group("sensors"):
-            if sensor.name in known:
+            # So is a bound that moves.
+            is_its_bound = self._bounded_by.get(sensor.name) == channel.name
+            if sensor.name in known or is_its_bound:
                 drawn.append(sensor)
         return view(channel.title, drawn, along)
 
@@ -314,17 +324,20 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
     first_color = {"actions": 2, "measurements": 2, "estimates": 4}.get(kind.name, 0)
     colors = cycle(SERIES[first_color:])
     channels = []
+    # A bound that moves is drawn as a signal, not as a line.
+    moving = {signal.bounded_state for signal in scenario.signals or ()}
     for name, unit in kind.units(scenario, units).items():
         entity = str(kind.group)
         if kind.group in ALONE:
             entity = f"{kind.group}/{escaped(name)}"
+        is_bounded = bool(kind.vector) and name not in moving
         second_of_its_view = name in ("penalty", "feedback_time")
         channel = Channel(
             entity=entity,
             name=name,
             unit=unit,
             color=SERIES[1] if second_of_its_view else next(colors),
-            bounds=scenario.limits.get(name, FREE) if kind.vector else FREE,
+            bounds=scenario.limits.get(name, FREE) if is_bounded else FREE,
             step=kind.name in HELD,
             # The first solves of a run take many times as long as the others.
             tail=0.05 if kind.clock else 0.0,

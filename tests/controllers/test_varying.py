@@ -14,7 +14,7 @@ from controllers.rti import nmpc
 from controllers.theta import ThetaBlocks
 from cosim import Scenario
 
-HORIZON = 4
+HORIZON = 3
 MODEL = {"model": "controllers.evaporator:priced_model", "horizon": HORIZON}
 SIGNALS = {
     "cooling": {"model": "T200"},
@@ -167,7 +167,7 @@ def value_by_hand(problem, theta, point, signals, s):  # noqa: PLR0915
     return 0.5 * z @ P @ z + c @ z + constant, z[N * n : N * n + m]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_the_qp_is_that_of_a_hand_with_other_values_at_each_stage(seed):
     problem = Problem.from_scenario(scenario())
     theta = tuned(problem)
@@ -183,7 +183,9 @@ def test_the_qp_is_that_of_a_hand_with_other_values_at_each_stage(seed):
 
 
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
-@pytest.mark.parametrize("enforced", [None, np.array([200.0, 210.0])])
+@pytest.mark.parametrize(
+    "enforced", [None, pytest.param(np.array([200.0, 210.0]), marks=pytest.mark.slow)]
+)
 def test_derivatives_are_those_by_differences(hessian, enforced):
     problem = Problem.from_scenario(scenario())
     theta = tuned(problem, ("C", "lambda_s"))
@@ -212,6 +214,7 @@ def test_derivatives_are_those_by_differences(hessian, enforced):
         assert moved == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SIGNALS)
 def test_nominal_values_change_nothing(name):
     without = Problem.from_scenario(scenario(()))
@@ -228,6 +231,7 @@ def test_nominal_values_change_nothing(name):
     assert varying.action == pytest.approx(still.action, rel=1e-13)
 
 
+@pytest.mark.slow
 def test_a_bound_that_is_known_to_move_is_that_of_a_scenario_with_it():
     moved = Scenario.load("paper").replace({"controller": {"horizon": HORIZON}})
     moved = moved.replace({"bounds": {"state_lower": [27.0, 40.0]}})
@@ -255,6 +259,7 @@ def test_beyond_what_is_known_the_last_value_holds():
     assert values[0] == values[1] == values[2]
 
 
+@pytest.mark.slow
 def test_the_converged_programme_takes_signals_too():
     problem = Problem.from_scenario(scenario())
     theta = tuned(problem)
@@ -290,6 +295,7 @@ def _with_condenser_in_theta():
     return problem, tuned(problem, ("UA2",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stagewise", [False, True])
 def test_compiled_code_gives_what_the_interpreter_gives(monkeypatch, stagewise):
     monkeypatch.setenv("COSIM_COMPILE", "now")
@@ -312,8 +318,9 @@ def test_compiled_code_gives_what_the_interpreter_gives(monkeypatch, stagewise):
             solutions.append(controller.feedback(STATE, a))
     for one, other in zip(solutions[:2], solutions[2:], strict=True):
         assert other.iterations is not None
-        assert other.value == pytest.approx(one.value, rel=1e-10)
-        assert other.action == pytest.approx(one.action, rel=1e-10)
+        # DAQP's accuracy, not rounding.
+        assert other.value == pytest.approx(one.value, rel=1e-9)
+        assert other.action == pytest.approx(one.action, rel=1e-9)
         assert other.value_gradient == pytest.approx(one.value_gradient, rel=1e-8, abs=1e-7)
     expected = solutions[0].policy_jacobian
     assert solutions[2].policy_jacobian == pytest.approx(expected, rel=1e-7, abs=1e-9)

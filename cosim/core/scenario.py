@@ -215,12 +215,13 @@ class EstimatorTable(Table):
 class SignalTable(Table):
     """A signal: what moves with time, what it moves, and what a controller knows of it.
 
-    Each value holds until the next one; the last one until the end of `period` or `once`.
+    Each value holds until the next one; the last one until the end of `period` or `once`. A signal
+    that `measures` a disturbance has none: its values are what the plant realises.
     """
 
     name: Name
     """Its name in messages and records, and to controllers."""
-    values: Annotated[Numbers, Field(min_length=1)]
+    values: Numbers = ()
     """Its values. A `file` takes their place, a CSV with a column of the signal's name and, if the
     values are not evenly spread, a column `time`."""
     times: NonNegatives | None = None
@@ -229,6 +230,10 @@ class SignalTable(Table):
     """Seconds after which the values begin again."""
     once: Positive | None = None
     """Seconds that the values last; a longer run is refused."""
+    measures: Name | None = None
+    """In place of values: the disturbance of the plant that is measured, and forecast."""
+    error: NonNegative = 0.0
+    """Standard deviation of a forecast's error a sample ahead; j samples ahead √j times that."""
     plant: Name | None = None
     """The FMU's input or tunable parameter that it drives, from the begin of each sample."""
     price_of: Name | None = None
@@ -261,6 +266,11 @@ class SignalTable(Table):
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
         where = f"signal '{self.name}'"
+        if self.measures is not None:
+            self._check_measurement(where)
+            return self
+        if not self.values:
+            raise ValueError(f"{where}: give values or a file, or what it measures")
         if (self.period is None) == (self.once is None):
             raise ValueError(
                 f"{where}: give period, the seconds after which its values begin again, or once, "
@@ -289,6 +299,15 @@ class SignalTable(Table):
         if self.ahead is not None and self.known != "preview":
             raise ValueError(f"{where}: ahead needs known = 'preview'")
         return self
+
+    def _check_measurement(self, where: str) -> None:
+        """Raise ValueError where a measured disturbance is more than that."""
+        fields = ("values", "times", "period", "once", "plant", "price_of", "bound", "reference")
+        for field in fields:
+            if getattr(self, field):
+                raise ValueError(f"{where}: it measures a disturbance, so it can have no {field}")
+        if self.model is None or self.known == "none":
+            raise ValueError(f"{where}: what it measures needs model, and known: now or preview")
 
     @property
     def length(self) -> float:
@@ -565,6 +584,12 @@ class Scenario(Shown, Table):
             changed |= change.parameters.keys()
         for signal in signals:
             where = f"signal '{signal.name}'"
+            measured = signal.measures
+            if measured is not None and measured not in plant.disturbances:
+                raise ValueError(
+                    f"{where}: it measures '{measured}', which is none of plant.disturbances"
+                    f"{instead(measured, plant.disturbances)}"
+                )
             if signal.plant in plant.actions:
                 raise ValueError(f"{where}: plant '{signal.plant}' is an action")
             if signal.plant in changed:
@@ -732,8 +757,13 @@ class Scenario(Shown, Table):
 
     @property
     def signal_names(self) -> tuple[str, ...]:
-        """Names of the signals in records, `signal[price]` say; none without signals."""
-        return tuple(f"signal[{signal.name}]" for signal in self.signals or ())
+        """Names of the valued signals in records, `signal[price]` say; none without any."""
+        return tuple(f"signal[{signal.name}]" for signal in self.valued_signals)
+
+    @property
+    def valued_signals(self) -> tuple[SignalTable, ...]:
+        """The signals that have values, and are no measured disturbance."""
+        return tuple(signal for signal in self.signals or () if signal.measures is None)
 
     @property
     def priced(self) -> tuple[str, ...]:

@@ -9,12 +9,14 @@ from math import floor
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.errors import ScenarioError
-from cosim.core.protocols import Array
+from cosim.core.errors import PlantError, ScenarioError
+from cosim.core.protocols import Array, Plant
 from cosim.core.scenario import Penalty, Scenario, SignalTable
 
 Known = Mapping[str, Array]
 """Values of each signal that is known, by its name: the present one, and those of a preview."""
+STREAM = 0x464F5245
+"""Word of the key that keeps the forecasts' errors apart from every other use of a seed."""
 ROUNDING = 1e-6
 """Share of a sample by which a value may begin late: k·h and its time are rounded."""
 
@@ -26,11 +28,16 @@ class Signals:
         scenario: with signals.
 
     Attributes:
-        tables: the signals.
+        tables: the signals that have values.
+        measured: those that are disturbances of the plant.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self.tables = tuple(scenario.signals or ())
+        self.tables = scenario.valued_signals
+        signals = scenario.signals or ()
+        self.measured = tuple(signal for signal in signals if signal.measures is not None)
+        # Of each measured disturbance what is known at each sample of a run (`foresee`).
+        self._forecasts: dict[str, Array] = {}
         self._scenario = scenario
         self._h = scenario.sampling_time
         self._times = [_times(table) for table in self.tables]
@@ -66,6 +73,55 @@ class Signals:
                 f"{table.once:g} s, and {purpose} needs {needed:g} s of it"
             )
 
+    def foresee(self, plant: Plant, seed: int, samples: int) -> None:
+        """Find out what the plant will realise in a run, and forecast it.
+
+        The plant takes the run's samples beforehand, from the same seed, under the reference
+        action; after that it has to be reset.
+
+        Args:
+            plant: of the scenario.
+            seed: of its noise.
+            samples: of the run.
+        """
+        if not self.measured:
+            return
+        scenario = self._scenario
+        longest = max(_ahead(table, scenario) for table in self.measured)
+        plant.reset(seed)
+        steps = [plant.step(scenario.reference_action) for _ in range(samples + longest)]
+        realised = np.array([step.disturbance for step in steps])
+        for number, table in enumerate(self.measured):
+            values = realised[:, scenario.plant.disturbances.index(str(table.measures))]
+            ahead = _ahead(table, scenario)
+            known = np.lib.stride_tricks.sliding_window_view(values, ahead + 1)[:samples].copy()
+            # Errors add up sample by sample; a function of seed, signal, and sample alone.
+            key = np.array([seed, STREAM], dtype=np.uint64)
+            counter = np.array([0, 0, 0, number], dtype=np.uint64)
+            generator = np.random.Generator(np.random.Philox(key=key, counter=counter))
+            draws = generator.standard_normal((samples, ahead))
+            known[:, 1:] += table.error * np.cumsum(draws, axis=1)
+            known.flags.writeable = False
+            self._forecasts[table.name] = known
+
+    def check_foreseen(self, disturbances: Array) -> None:
+        """Check that a run realised what was foreseen.
+
+        Args:
+            disturbances: of the run, (K, p).
+
+        Raises:
+            PlantError: a measured disturbance depends on the actions.
+        """
+        for table in self.measured:
+            place = self._scenario.plant.disturbances.index(str(table.measures))
+            foreseen = self._forecasts[table.name][: len(disturbances), 0]
+            if not np.array_equal(foreseen, disturbances[:, place]):
+                raise PlantError(
+                    f"signal '{table.name}': disturbance '{table.measures}' is another one under "
+                    "other actions, so that nobody can forecast it: take the signal out"
+                )
+
     def _lasts_to(self, i: int, k: int) -> bool:
         """Whether signal i has a value at sample k."""
         once = self.tables[i].once
@@ -73,10 +129,7 @@ class Signals:
 
     def ahead(self, i: int) -> int:
         """Samples beyond the present one of which signal i is known."""
-        table = self.tables[i]
-        if table.known != "preview":
-            return 0
-        return table.ahead or self._scenario.controller.horizon
+        return _ahead(self.tables[i], self._scenario)
 
     def value(self, i: int, k: int) -> float:
         """Value of signal i at sample k; raises ScenarioError beyond its end."""
@@ -120,6 +173,8 @@ class Signals:
             if table.known == "none":
                 continue
             known[table.name] = self._part(i, k, k + self.ahead(i) + 1)
+        for name, forecasts in self._forecasts.items():
+            known[name] = forecasts[k]
         return known
 
     def _part(self, i: int, first: int, end: int) -> Array:
@@ -179,6 +234,13 @@ class Signals:
             rows = [row for row, other in enumerate(penalties) if other is penalty]
             groups.append((penalty, np.array(rows, dtype=np.intp)))
         return groups
+
+
+def _ahead(table: SignalTable, scenario: Scenario) -> int:
+    """Samples beyond the present one of which a signal is known."""
+    if table.known != "preview":
+        return 0
+    return table.ahead or scenario.controller.horizon
 
 
 def _times(table: SignalTable) -> list[float]:

@@ -13,7 +13,7 @@ import numpy as np
 from cosim.core.errors import CosimError, PlantError, RunEndedError
 from cosim.core.loop import ClosedLoop, Sample, controller_name
 from cosim.core.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
-from cosim.core.signals import signals_of
+from cosim.core.signals import Signals, signals_of
 from cosim.core.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
 from cosim.core.validation import whole_number
 
@@ -87,9 +87,10 @@ def simulate(
     signals = signals_of(plant.scenario)
     if signals is not None:
         signals.require(steps)
+        signals.foresee(plant, spawn_seeds(seed)[0], steps)
     _compile(controller, steps)
     # The columns are there before the recorder opens its file: they may not fit the memory.
-    run = _Run(plant, controller, steps, seed, residuals)
+    run = _Run(plant, controller, steps, seed, residuals, signals)
     if recorder is not None:
         recorder.start(plant.scenario, controller, seed, steps, plant.units)
     # A recorder reads the predictions, which a compiled loop does not keep.
@@ -110,7 +111,10 @@ def simulate(
         ended = RunEndedError(f"{error}; the run ended after {run.done} of {steps} samples")
         ended.trajectory = run.trajectory()
         raise ended from error
-    return run.trajectory()
+    trajectory = run.trajectory()
+    if signals is not None:
+        signals.check_foreseen(trajectory.disturbances)
+    return trajectory
 
 
 def _compile(controller: Controller, steps: int) -> None:
@@ -150,11 +154,11 @@ class _Run:
         steps: int,
         seed: int,
         residuals: bool,
+        signals: Signals | None,
     ) -> None:
         scenario = plant.scenario
         self._plant = plant
         self._controller = controller
-        signals = signals_of(scenario)
         known = None if signals is None else signals.known
         self._loop = ClosedLoop(plant.step, controller, scenario, known=known)
         self._scenario = scenario

@@ -521,7 +521,7 @@ def _units(scenario: Scenario, archive: UnpackedFmu) -> dict[str, str]:
         units[name] = units[sensor.variable]
     for name, estimate in zip(plant.states, scenario.estimate_names, strict=False):
         units[estimate] = units[name]
-    for signal, name in zip(scenario.signals or (), scenario.signal_names, strict=True):
+    for signal, name in zip(scenario.valued_signals, scenario.signal_names, strict=True):
         # That of what it drives, or is; a price has none.
         target = signal.plant or signal.bounded_state or signal.reference
         units[name] = archive.unit(target) if target else ""

@@ -108,7 +108,7 @@ class RerunRecorder:
         self._status: str | None = None
         # Of each signal the state whose bound it is; empty where it is none.
         self._bounded_by = {}
-        for signal, title in zip(scenario.signals or (), scenario.signal_names, strict=True):
+        for signal, title in zip(scenario.valued_signals, scenario.signal_names, strict=True):
             self._bounded_by[title] = signal.bounded_state
         properties = {
             "scenario": scenario.name,

@@ -8,7 +8,7 @@ import pytest
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.errors import PlantError, ScenarioError
-from cosim.core.protocols import Decision
+from cosim.core.protocols import Decision, Step
 from cosim.core.signals import Signals
 
 PRICE = {"name": "price", "price_of": "F100", "included": 600.0}
@@ -172,8 +172,51 @@ def test_a_scenario_with_a_file_holds_its_values(tmp_path):
     assert Scenario.load(path).hash != scenario.hash
 
 
+FORECAST = {"name": "feed", "measures": "X1", "error": 0.5, "model": "X1", "known": "preview"}
+
+
+def test_a_forecast_begins_with_what_is_realised_and_its_error_grows():
+    scenario = with_signals(FORECAST | {"ahead": 9})
+    realised, told = run(scenario, 1500)
+    known = np.array([each["feed"] for each in told])
+    assert np.array_equal(known[:, 0], realised["X1"])
+    still, _ = run(Scenario.load("paper"), 1500)
+    assert np.array_equal(realised.states, still.states)
+    coming = np.lib.stride_tricks.sliding_window_view(realised["X1"], 10)
+    errors = known[: len(coming), 1:] - coming[:, 1:]
+    expected = 0.5 * np.sqrt(np.arange(1, 10))
+    # Four standard errors of a standard deviation of so many draws.
+    assert errors.std(axis=0) == pytest.approx(expected, rel=4 / math.sqrt(2 * len(coming)))
+    _, again = run(scenario, 1500)
+    assert again == told
+    _, exact = run(with_signals(FORECAST | {"ahead": 9, "error": 0.0}), 40)
+    assert np.array_equal([each["feed"] for each in exact[:31]], coming[:31])
+
+
+def test_a_disturbance_that_follows_the_actions_cannot_be_forecast():
+    scenario = with_signals(FORECAST)
+
+    class Following:
+        """A plant whose disturbances are its actions."""
+
+        def reset(self, seed):
+            return scenario.initial_state
+
+        def step(self, a):
+            return Step(scenario.initial_state, 0.0, 0.0, np.resize(a, 4))
+
+    signals = Signals(scenario)
+    signals.foresee(Following(), 1, 20)
+    signals.check_foreseen(np.tile(np.resize(scenario.reference_action, 4), (20, 1)))
+    with pytest.raises(PlantError, match="nobody can forecast it"):
+        signals.check_foreseen(np.ones((20, 4)))
+
+
 BAD = [
-    (BOUND | {"values": []}, "signal"),
+    (FORECAST | {"measures": "X7"}, "none of plant.disturbances"),
+    (FORECAST | {"known": "none"}, "needs model, and known"),
+    (FORECAST | {"values": [5.0], "period": 60.0}, "can have no values"),
+    (BOUND | {"values": []}, "give values or a file"),
     (BOUND | {"values": [25.0]}, "give period"),
     (BOUND | {"values": [25.0], "period": 60.0, "once": 60.0}, "give period"),
     (BOUND | {"values": [math.nan], "period": 60.0}, "values"),

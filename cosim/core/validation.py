@@ -146,7 +146,9 @@ def _fields(model: type[BaseModel], path: list[Any]) -> list[str]:
         # An entry of a list of tables.
         if isinstance(part, int):
             continue
-        annotation = model.model_fields[str(part)].annotation
+        # A file has a field's alias where it has one.
+        by_key = {info.alias or name: info for name, info in model.model_fields.items()}
+        annotation = by_key[str(part)].annotation
         # The table itself, in a union with None, or in a list of such a union.
         candidates = [annotation]
         for inner in get_args(annotation):

@@ -106,6 +106,8 @@ class RerunRecorder:
             self._fine.append(replace(channel, entity=entity, color=color, labels=["within"]))
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
         self._status: str | None = None
+        # A forecast may have driven the plant already.
+        self._within.clear()
         # Of each signal the state whose bound it is; empty where it is none.
         self._bounded_by = {}
         for signal, title in zip(scenario.valued_signals, scenario.signal_names, strict=True):

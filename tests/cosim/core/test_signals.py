@@ -213,6 +213,7 @@ def test_a_disturbance_that_follows_the_actions_cannot_be_forecast():
 
 
 BAD = [
+    (BOUND | {"values": [25.0], "periodd": 60.0}, "unknown field .did you mean 'period'"),
     (FORECAST | {"measures": "X7"}, "none of plant.disturbances"),
     (FORECAST | {"known": "none"}, "needs model, and known"),
     (FORECAST | {"values": [5.0], "period": 60.0}, "can have no values"),

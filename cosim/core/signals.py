@@ -133,6 +133,12 @@ class Signals:
 
     def value(self, i: int, k: int) -> float:
         """Value of signal i at sample k; raises ScenarioError beyond its end."""
+        if k >= len(self._at_samples[i]):
+            self._find_values(i, k + 1)
+        return float(self._at_samples[i][k])
+
+    def _value(self, i: int, k: int) -> float:
+        """`value`, looked up in the table."""
         table = self.tables[i]
         if not self._lasts_to(i, k):
             raise ScenarioError(
@@ -179,18 +185,22 @@ class Signals:
 
     def _part(self, i: int, first: int, end: int) -> Array:
         """Values of signal i at the samples `first` to `end`, without this one, read-only."""
+        if len(self._at_samples[i]) < end:
+            self._find_values(i, end)
+        return self._at_samples[i][first:end]
+
+    def _find_values(self, i: int, end: int) -> None:
+        """Look the values of signal i up, to before sample `end` and as many again."""
         values = self._at_samples[i]
-        if len(values) < end:
-            # Twice as many each time; beyond its end it has none.
-            more = [self.value(i, k) for k in range(len(values), end)]
-            for k in range(end, 2 * end):
-                if not self._lasts_to(i, k):
-                    break
-                more.append(self.value(i, k))
-            values = np.concatenate([values, more])
-            values.flags.writeable = False
-            self._at_samples[i] = values
-        return values[first:end]
+        more = [self._value(i, k) for k in range(len(values), end)]
+        for k in range(end, 2 * end):
+            # It may have none beyond its end.
+            if not self._lasts_to(i, k):
+                break
+            more.append(self._value(i, k))
+        values = np.concatenate([values, more])
+        values.flags.writeable = False
+        self._at_samples[i] = values
 
     def penalty(self, k: int) -> Penalty:
         """Penalty of a state by the bounds at sample k."""

@@ -297,11 +297,11 @@ class FmuPlant:
         assert self._signals is not None
         driving = []
         prices = []
-        for table, value in zip(self._signals.tables, self._signals.at(k).tolist(), strict=True):
+        for i, table in enumerate(self._signals.tables):
             if table.plant is not None:
-                driving.append(value)
+                driving.append(self._signals.value(i, k))
             if table.price_of is not None:
-                prices.append(value - table.included)
+                prices.append(self._signals.value(i, k) - table.included)
         if driving:
             self._drive_signals(driving)
         return prices

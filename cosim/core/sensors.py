@@ -34,9 +34,12 @@ class Sensors:
     def __init__(self, tables: Sequence[SensorTable]) -> None:
         self.variables = tuple(table.variable for table in tables)
         self._tables = tuple(tables)
-        self._memory = max(table.delay for table in tables) + 1
+        longest_delay = max(table.delay for table in tables)
+        self._memory = longest_delay + 1
         self._seed = 0
+        # The variables' values at the last samples: sample j is in row j mod memory.
         self._past: Array = np.full((self._memory, len(tables)), nan)
+        # Of each sensor the block of draws that was used last, with its number.
         self._blocks: dict[int, tuple[int, Array]] = {}
 
     def start(self, seed: int, values: Sequence[float]) -> Array:
@@ -64,30 +67,36 @@ class Sensors:
         Returns:
             y_k, (n_y,), what arrives at sample k; NaN where nothing does.
         """
-        # A ring of the last values: sample j is in row j mod memory.
         self._past[k % self._memory] = values
         y = np.full(len(self._tables), nan)
         for i, table in enumerate(self._tables):
+            # The sample at which the reading was taken that arrives now.
             taken = k - table.delay
             if taken < 0 or taken % table.every != 0:
                 continue
-            y[i] = self._past[taken % self._memory, i]
+            value = self._past[taken % self._memory, i]
             if table.deviation > 0.0:
-                y[i] += table.deviation * self._noise(i, taken)
+                value += table.deviation * self._noise(i, taken)
+            y[i] = value
         return y
 
     def _noise(self, i: int, k: int) -> float:
         """The standard normal draw of sensor i at sample k."""
-        block = k // DRAWS_AT_ONCE
-        number, draws = self._blocks.get(i, (-1, np.empty(0)))
-        if number != block:
-            # As integers of 64 bits: in a list NumPy would round a large seed.
-            key = np.array([self._seed, STREAM], dtype=np.uint64)
-            counter = np.array([0, 0, block, i], dtype=np.uint64)
-            generator = np.random.Philox(key=key, counter=counter)
-            draws = np.random.Generator(generator).standard_normal(DRAWS_AT_ONCE)
-            self._blocks[i] = block, draws
-        return float(draws[k % DRAWS_AT_ONCE])
+        block, index = divmod(k, DRAWS_AT_ONCE)
+        kept_block, draws = self._blocks.get(i, (-1, np.empty(0)))
+        if kept_block != block:
+            draws = self._draw_block(i, block)
+            self._blocks[i] = (block, draws)
+        return float(draws[index])
+
+    def _draw_block(self, i: int, block: int) -> Array:
+        """The standard normal draws of sensor i in a block of samples, (DRAWS_AT_ONCE,)."""
+        # As integers of 64 bits: in a list NumPy would round a large seed.
+        key = np.array([self._seed, STREAM], dtype=np.uint64)
+        # The low words of the counter are those that the draws of a block count up.
+        counter = np.array([0, 0, block, i], dtype=np.uint64)
+        philox = np.random.Philox(key=key, counter=counter)
+        return np.random.Generator(philox).standard_normal(DRAWS_AT_ONCE)
 
     def state(self) -> tuple[int, Array]:
         """What `restore` needs to go on from here: the seed, and a copy of the last values."""
@@ -96,6 +105,7 @@ class Sensors:
     def restore(self, state: tuple[int, Array]) -> None:
         """Go back to a `state`."""
         seed, past = state
+        # The blocks are draws of one seed.
         if seed != self._seed:
             self._blocks = {}
         self._seed = seed
@@ -112,5 +122,7 @@ class Sensors:
         if len(data) < end:
             raise PlantError("these bytes are not the plant state of a scenario with these sensors")
         (seed,) = _SEED.unpack_from(data)
-        past = np.frombuffer(data[_SEED.size : end]).reshape(self._past.shape).copy()
+        numbers = np.frombuffer(data[_SEED.size : end])
+        # A copy: what lies in bytes cannot be written.
+        past = numbers.reshape(self._past.shape).copy()
         return (seed, past), data[end:]

@@ -49,7 +49,8 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     """
     seed = whole_number("seed", seed, 0, CosimError)
     plant, exploration = np.random.SeedSequence(seed).spawn(2)
-    return int(plant.generate_state(1, np.uint64)[0]), np.random.default_rng(exploration)
+    (plant_seed,) = plant.generate_state(1, np.uint64)
+    return int(plant_seed), np.random.default_rng(exploration)
 
 
 def simulate(
@@ -307,19 +308,25 @@ class _Run:
         """Store rows of the signals that are `MEASURED`, and those that follow; all by name."""
         end = first + len(table)
         self.done = end
+        # Views of the whole run's columns.
         stored = {name: column[first:end] for name, column in self._columns.items()}
+        samples = np.arange(first, end)
         # k·h, never a sum of h.
-        stored["time"][:] = np.arange(first, end) * self._scenario.sampling_time
+        stored["time"][:] = samples * self._scenario.sampling_time
         parts = np.split(table, self._ends[:-1], axis=1)
         for name, part in zip(MEASURED, parts, strict=True):
-            stored[name][:] = part.reshape(stored[name].shape)
+            column = stored[name]
+            # A signal that is no vector is a column of one axis.
+            column[:] = part.reshape(column.shape)
         # A compiled loop has them at no cost; the interpreted one does not ask for them.
         if not self._residuals:
             stored["residual"][:] = nan
         # In the order of their declaration: one may need another.
         for kind in SIGNALS:
-            if kind.derive is not None:
-                stored[kind.name][:] = kind.derive(self._scenario, stored)
+            if kind.derive is None:
+                continue
+            values = kind.derive(self._scenario, stored)
+            stored[kind.name][:] = values
         return stored
 
     def _number(self, solution: Solution, name: str) -> float:
@@ -330,9 +337,11 @@ class _Run:
             return value
         numbers = int | float | np.integer | np.floating
         if isinstance(value, bool) or not isinstance(value, numbers):
-            shown = " ".join(f"{value!r:.60}".split())
-            number = self._loop.number - 1
-            raise self._loop.wrong(f"a {name} that is no number but {shown}", number)
+            # An array's text has several lines; a message is one.
+            one_line = " ".join(f"{value!r:.60}".split())
+            # The loop has counted this sample already.
+            sample = self._loop.number - 1
+            raise self._loop.wrong(f"a {name} that is no number but {one_line}", sample)
         return float(value)
 
     def _keep_prediction(self, k: int, solution: Solution) -> None:
@@ -343,9 +352,11 @@ class _Run:
         row = k % self._length
         try:
             for name, values in predictions.items():
+                # The first prediction of a part says how long the horizon is.
                 if name not in self._predicted:
                     shape = (self._length, *np.shape(values))
                     self._predicted[name] = np.full(shape, nan)
+                # A sample whose solve failed stays without.
                 self._predicted[name][row] = values
         except (TypeError, ValueError) as error:
             wrong = self._loop.wrong(f"a prediction of another shape or kind ({error})", k)
@@ -390,11 +401,13 @@ def indicators(run: Trajectory, burn_in: int = 0) -> dict[str, float]:
         run: its samples.
         burn_in: samples at the start that do not count.
     """
-    scenario = run.scenario
+    lower = run.scenario.action_lower
+    upper = run.scenario.action_upper
     actions = run.actions[burn_in:]
+    failed = run["failed"][burn_in:]
     values = run.means(burn_in)
-    values["input_effort"] = input_effort(actions, scenario.action_lower, scenario.action_upper)
-    values["failures"] = float(np.sum(run["failed"][burn_in:]))
+    values["input_effort"] = input_effort(actions, lower, upper)
+    values["failures"] = float(np.sum(failed))
     return values
 
 
@@ -443,8 +456,14 @@ def indicators_of(
     Returns:
         Values (S,) by name.
     """
-    rows = [measure(plant, controller, seed, steps)[0] for seed in seeds]
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    rows = []
+    for seed in seeds:
+        values, _ = measure(plant, controller, seed, steps)
+        rows.append(values)
+    table = {}
+    for name in rows[0]:
+        table[name] = np.array([row[name] for row in rows])
+    return table
 
 
 def input_effort(
@@ -464,8 +483,10 @@ def input_effort(
     """
     if len(actions) < 2:
         return 0.0
-    moves = np.abs(np.diff(actions, axis=0)) / (upper - lower)
-    return float(np.mean(np.sum(moves, axis=1)))
+    moves = np.abs(np.diff(actions, axis=0))
+    shares = moves / (upper - lower)
+    effort = np.sum(shares, axis=1)
+    return float(np.mean(effort))
 
 
 @contextmanager

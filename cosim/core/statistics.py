@@ -7,7 +7,7 @@ arrays are paired: entry s of each belongs to seed s. Intervals are of 95 %.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import floor, isfinite, log10
+from math import floor, isfinite, log10, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ AT_ONCE = RESAMPLES * 1000
 """Most values that are drawn at once."""
 NEGLIGIBLE = 1e-12
 """Spread of values, relative to the larger of 1 and their mean, that is taken for none."""
+EXHAUSTIVE_PAIRS = 12
+"""Most pairs of runs for which all flips of signs are tried, 2¹² = 4096 of them."""
 TD_WINDOW = 10_000
 """Samples over which a TD error is averaged (paper.tex, fig. nmpc_learn)."""
 
@@ -55,10 +57,13 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
         The ratio; NaN where the denominator's mean is zero.
     """
     below = float(np.mean(denominator))
-    value = float(np.mean(numerator)) / below if below else float("nan")
+    above = float(np.mean(numerator))
+    if not below:
+        return Estimate(nan)
+    value = above / below
     # An infinite cost has no interval.
     with np.errstate(invalid="ignore"):
-        linearised = (numerator - value * denominator) / (below or 1.0)
+        linearised = (numerator - value * denominator) / below
     return Estimate(value, _t_interval(linearised, value))
 
 
@@ -73,11 +78,15 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
         None for one seed, for more than `RESAMPLED`, and where a value is not finite.
     """
     seeds = len(numerator)
-    total = np.sum(denominator)
-    if not 2 <= seeds <= RESAMPLED or not np.isfinite(numerator).all() or not total:
+    if not 2 <= seeds <= RESAMPLED or not np.isfinite(numerator).all():
         return None
-    value = float(np.sum(numerator) / total)
-    without_one = (np.sum(numerator) - numerator) / (total - denominator)
+    above = np.sum(numerator)
+    below = np.sum(denominator)
+    if not below:
+        return None
+    value = float(above / below)
+    # The ratio of all seeds but one, for each: BCa's acceleration is that of their differences.
+    without_one = (above - numerator) / (below - denominator)
     # BCa is undefined where no seed counts.
     if _all_equal(without_one, value):
         return value, value
@@ -94,7 +103,8 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
 
 def _all_equal(values: Array, level: float) -> bool:
     """Whether values differ by rounding alone, at a mean of about `level`."""
-    return bool(np.ptp(values) <= NEGLIGIBLE * max(1.0, abs(level)))
+    scale = max(1.0, abs(level))
+    return bool(np.ptp(values) <= NEGLIGIBLE * scale)
 
 
 def _bootstrap(data: Sequence[Array], statistic: Callable[..., Any], **options: Any) -> Interval:
@@ -102,16 +112,18 @@ def _bootstrap(data: Sequence[Array], statistic: Callable[..., Any], **options: 
     from scipy import stats  # noqa: PLC0415 - most of a second
 
     longest = max(len(values) for values in data)
-    interval = stats.bootstrap(
+    result = stats.bootstrap(
         tuple(data),
         statistic,
         n_resamples=RESAMPLES,
         batch=max(1, AT_ONCE // longest),
         confidence_level=LEVEL,
+        # The same table has the same interval, whoever makes it.
         rng=np.random.default_rng(0),
         **options,
-    ).confidence_interval
-    return float(interval.low), float(interval.high)
+    )
+    low, high = result.confidence_interval
+    return float(low), float(high)
 
 
 def regret(cost: Array, optimum: Array) -> Estimate:
@@ -224,13 +236,17 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
     Returns:
         The other axes, (…); a scalar for (R,).
     """
-    ordered = np.sort(np.moveaxis(values, axis, -1))
+    runs_last = np.moveaxis(values, axis, -1)
+    ordered = np.sort(runs_last)
     count = ordered.shape[-1]
-    edges = np.clip(np.arange(count + 1), 0.25 * count, 0.75 * count)
+    # Entry i has the interval [i, i+1] of ranks; its weight is what of that is in the middle half.
+    ranks = np.arange(count + 1)
+    edges = np.clip(ranks, 0.25 * count, 0.75 * count)
     weight = np.diff(edges)
     # Values outside may be infinite.
     inside = np.where(weight > 0, ordered, 0.0)
-    return (inside * weight).sum(axis=-1) / weight.sum()
+    total = (inside * weight).sum(axis=-1)
+    return total / weight.sum()
 
 
 def over_runs(strata: Sequence[Array]) -> Estimate:
@@ -250,15 +266,18 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
     for runs in strata:
         if len(runs) < 2 or not np.isfinite(runs).all():
             return Estimate(value)
-        every_run_equal = every_run_equal and _all_equal(runs, value)
+        if not _all_equal(runs, value):
+            every_run_equal = False
     # Percentiles of equal numbers differ from them in the last bit on some processors.
     if every_run_equal:
         return Estimate(value, (value, value))
 
     def middle(*resampled: Array, axis: int) -> Any:
-        return interquartile_mean(np.concatenate(resampled, axis=axis), axis)
+        all_runs = np.concatenate(resampled, axis=axis)
+        return interquartile_mean(all_runs, axis)
 
-    return Estimate(value, _bootstrap(strata, middle, method="percentile"))
+    interval = _bootstrap(strata, middle, method="percentile")
+    return Estimate(value, interval)
 
 
 def td_error_mean(
@@ -278,18 +297,22 @@ def td_error_mean(
     Returns:
         (K,), NaN where there was no update.
     """
+    # A row without an update has no error.
     counts = np.where(np.isfinite(td_error), updates, 0.0)
     errors = np.where(counts > 0, td_error, 0.0)
+    row_squares = errors**2 * counts
     # Sums over a window are differences of sums from the start, which begin with 0.
     count_sums = np.append(0.0, np.cumsum(counts))
-    square_sums = np.append(0.0, np.cumsum(errors**2 * counts))
+    square_sums = np.append(0.0, np.cumsum(row_squares))
     ends = np.append(0.0, samples)
     first = np.searchsorted(ends, samples - window, side="left")
     n_updates = count_sums[1:] - count_sums[first]
     squares = square_sums[1:] - square_sums[first]
     # Rounding may leave a sum of squares below zero.
-    mean_square = np.maximum(squares, 0.0) / np.where(n_updates > 0, n_updates, 1.0)
-    return np.where(n_updates > 0, np.sqrt(mean_square), np.nan)
+    squares = np.maximum(squares, 0.0)
+    has_updates = n_updates > 0
+    mean_square = squares / np.where(has_updates, n_updates, 1.0)
+    return np.where(has_updates, np.sqrt(mean_square), np.nan)
 
 
 def shown(
@@ -307,10 +330,13 @@ def shown(
         digits: significant digits of the value; the interval's half width has two.
     """
     value *= scale
+    places = decimals(value, digits)
     if ends is None:
-        return f"{value:.{decimals(value, digits)}f}"
+        return f"{value:.{places}f}"
     low, high = (scale * end for end in ends)
-    places = max(decimals(value, digits), decimals((high - low) / 2, 2))
+    half_width = (high - low) / 2
+    # All three with the same decimals: one compares them.
+    places = max(places, decimals(half_width, 2))
     return f"{value:.{places}f} [{low:.{places}f}, {high:.{places}f}]"
 
 
@@ -324,21 +350,25 @@ def decimals(value: float, digits: int) -> int:
     if not isfinite(value) or value == 0:
         return 0
     first_digit = floor(log10(abs(value)))
-    return min(max(digits - 1 - first_digit, 0), 9)
+    needed = digits - 1 - first_digit
+    return min(max(needed, 0), 9)
 
 
 def magnitude(reference: Array) -> Array:
     """The reference with the sign that makes its mean positive: a cost may be a profit."""
-    return -reference if float(np.mean(reference)) < 0 else reference
+    is_profit = float(np.mean(reference)) < 0
+    return -reference if is_profit else reference
 
 
 def _t_interval(errors: Array, value: float) -> Interval:
     """Student's interval; None for fewer than two values, or where one is not finite."""
-    if len(errors) < 2 or not np.isfinite(errors).all():
+    count = len(errors)
+    if count < 2 or not np.isfinite(errors).all():
         return None
     # Not by scipy.stats, which takes most of a second to import.
-    quantile = stdtrit(len(errors) - 1, 0.5 + LEVEL / 2)
-    half = float(quantile * (np.std(errors, ddof=1) / np.sqrt(len(errors))))
+    quantile = stdtrit(count - 1, 0.5 + LEVEL / 2)
+    standard_error = np.std(errors, ddof=1) / np.sqrt(count)
+    half = float(quantile * standard_error)
     return value - half, value + half
 
 
@@ -360,6 +390,7 @@ def paired_difference(
     Returns:
         The median, its interval over pairs and noise, and p, NaN for fewer than two pairs.
     """
+    # Of each pair the mean over its noise.
     differences = (cost - other).mean(axis=1) / magnitude(optimum).mean()
     # A cost that is no number is the worst.
     differences = np.where(np.isnan(differences), np.inf, differences)
@@ -376,18 +407,20 @@ def _sign_flip_probability(differences: Array) -> float:
     from scipy.stats import rankdata  # noqa: PLC0415 - most of a second
 
     ranks = rankdata(np.abs(differences))
-    # Sums of ranks are multiples of a half.
-    observed = abs(float(np.sign(differences) @ ranks)) - 1e-9
-    if count > 12:
+    rank_sum = float(np.sign(differences) @ ranks)
+    # Sums of ranks are multiples of a half: rounding must not decide.
+    observed = abs(rank_sum) - 1e-9
+    if count > EXHAUSTIVE_PAIRS:
         rng = np.random.default_rng(0)
-        flips = rng.choice([-1.0, 1.0], size=(RESAMPLES, count))
-        reached = np.abs(flips @ ranks) >= observed
+        signs = rng.choice([-1.0, 1.0], size=(RESAMPLES, count))
+        reached = np.abs(signs @ ranks) >= observed
         # What was observed is one of the ways, too.
         return float((1 + reached.sum()) / (1 + RESAMPLES))
     # Row k has the bits of k as signs.
     numbers = np.arange(2**count)[:, None]
     bits = (numbers >> np.arange(count)) & 1
-    reached = np.abs((2.0 * bits - 1) @ ranks) >= observed
+    signs = 2.0 * bits - 1
+    reached = np.abs(signs @ ranks) >= observed
     return float(reached.mean())
 
 
@@ -403,16 +436,19 @@ def median_over_runs(values: Array) -> Estimate:
         The median; no interval for one run, or where a value is no number.
     """
     value = float(np.median(values))
-    if len(values) < 2 or np.isnan(values).any():
+    count = len(values)
+    if count < 2 or np.isnan(values).any():
         return Estimate(value)
     rng = np.random.default_rng(0)
-    rows = rng.integers(len(values), size=(len(values), RESAMPLES))
-    return Estimate(value, _percentiles(np.median(values[rows], axis=0)))
+    drawn = rng.integers(count, size=(count, RESAMPLES))
+    medians = np.median(values[drawn], axis=0)
+    return Estimate(value, _percentiles(medians))
 
 
 def _percentiles(resampled: Array) -> Interval:
     """Interval of resampled values, some of which may be infinite."""
     quantiles = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
+    # One of the values: between a finite and an infinite one lies none.
     low, high = np.quantile(resampled, quantiles, method="nearest")
     return float(low), float(high)
 
@@ -434,7 +470,8 @@ def two_way(
     Returns:
         None for one noise seed.
     """
-    terms = cost - (optimum if other is None else other)
+    counterpart = optimum if other is None else other
+    terms = cost - counterpart
     below = magnitude(optimum)
     n_runs, n_seeds = terms.shape
     if n_seeds < 2:
@@ -443,10 +480,13 @@ def two_way(
     draws = max(1, min(RESAMPLES, AT_ONCE // n_seeds))
     # How often each seed is drawn, as a weight: a resampled mean is a product.
     equal = np.full(n_seeds, 1 / n_seeds)
-    weights = rng.multinomial(n_seeds, equal, size=draws).T / n_seeds
+    counts = rng.multinomial(n_seeds, equal, size=draws)
+    weights = counts.T / n_seeds
     # An infinite cost stays one in every draw, where 0·∞ would be no number.
     finite = np.isfinite(terms).all(axis=1)
     values = np.full((n_runs, draws), np.inf)
     values[finite] = terms[finite] @ weights / (below @ weights)
-    rows = rng.integers(n_runs, size=(n_runs, draws))
-    return _percentiles(np.median(np.take_along_axis(values, rows, axis=0), axis=0))
+    # In each draw of the noise, as many runs as there are, with replacement.
+    drawn = rng.integers(n_runs, size=(n_runs, draws))
+    resampled = np.take_along_axis(values, drawn, axis=0)
+    return _percentiles(np.median(resampled, axis=0))

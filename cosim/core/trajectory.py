@@ -66,8 +66,10 @@ class SignalKind:
         """
         if self.vector:
             return {name: known.get(name, "") for name in self.names(scenario)}
-        cost = known.get(scenario.plant.stage_cost, "")
-        return {self.name: cost if self.unit == COST else self.unit}
+        unit = self.unit
+        if unit == COST:
+            unit = known.get(scenario.plant.stage_cost, "")
+        return {self.name: unit}
 
 
 def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
@@ -156,7 +158,10 @@ class RunSignals:
     def label(self) -> str:
         """The run's folder, or the file where its name says more than `trajectory` or `run`."""
         path = Path(self.name)
-        return path.parent.name or path.stem if path.stem in ("trajectory", "run") else path.stem
+        is_plain_name = path.stem in ("trajectory", "run")
+        if is_plain_name and path.parent.name:
+            return path.parent.name
+        return path.stem
 
     def __len__(self) -> int:
         return max((len(signal.values) for signal in self.signals.values()), default=0)
@@ -215,8 +220,11 @@ class Trajectory(Result):
 
     def _facts(self) -> dict[str, object]:
         summary = self.summary()
-        facts: dict[str, object]
-        facts = {"scenario": self.scenario.name, "controller": self.controller, "seed": self.seed}
+        facts: dict[str, object] = {
+            "scenario": self.scenario.name,
+            "controller": self.controller,
+            "seed": self.seed,
+        }
         for name in ("samples", "J", "economic_cost", "violating_share", "failures"):
             facts[name] = summary[name]
         return facts
@@ -225,8 +233,11 @@ class Trajectory(Result):
         """The signals as a pandas data frame, a row for each sample, a column for each signal."""
         import pandas as pd  # noqa: PLC0415 - half a second
 
-        columns = {name: signal.values for name, signal in self.signals.items()}
-        return pd.DataFrame(columns | {STATUS: list(self.status)})
+        columns: dict[str, Any] = {}
+        for name, signal in self.signals.items():
+            columns[name] = signal.values
+        columns[STATUS] = list(self.status)
+        return pd.DataFrame(columns)
 
     def figure(self) -> Figure:
         """States, actions, disturbances and costs over time, with their bounds."""
@@ -261,14 +272,16 @@ class Trajectory(Result):
         `cosim.core.scenario.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does
         not count; `J` mean of ℓ + penalty, to which every violation counts.
         """
-        cost = self["stage_cost"][burn_in:]
+        economic_cost = self["stage_cost"][burn_in:]
         penalty = self["penalty"][burn_in:]
         violation = self["violation"][burn_in:]
+        violates = violation > VIOLATING
+        cost = economic_cost + penalty
         return {
-            "economic_cost": float(np.mean(cost)),
+            "economic_cost": float(np.mean(economic_cost)),
             "mean_violation": float(np.mean(violation)),
-            "violating_share": float(np.mean(violation > VIOLATING)),
-            "J": float(np.mean(cost + penalty)),
+            "violating_share": float(np.mean(violates)),
+            "J": float(np.mean(cost)),
         }
 
     def summary(self) -> dict[str, Any]:
@@ -276,12 +289,16 @@ class Trajectory(Result):
 
         `failures` are samples under the fallback action; `statuses` samples by status.
         """
+        statuses = Counter(self.status)
+        final_state = None
+        if self.final_state is not None:
+            final_state = self.final_state.tolist()
         return {
             "samples": len(self),
             **self.means(),
             "failures": int(np.sum(self["failed"])),
-            "statuses": dict(sorted(Counter(self.status).items())),
-            "final_state": None if self.final_state is None else self.final_state.tolist(),
+            "statuses": dict(sorted(statuses.items())),
+            "final_state": final_state,
         }
 
     def timing_summary(self) -> dict[str, dict[str, float]]:
@@ -304,27 +321,40 @@ class Trajectory(Result):
     def write_timing_csv(self, path: str | Path) -> Path:
         """Write the wall-clock times in µs to a file, apart from what must repeat to the bit."""
         header = [f"{name} [us]" for name in self.timing]
-        rows = _rows(list(self.timing.values()))
-        texts = ([f"{1e6 * value:.3f}" for value in row] for row in rows)
-        return _write(path, header, texts)
+        return _write(path, header, self._timing_rows())
+
+    def _timing_rows(self) -> Iterator[list[str]]:
+        """Rows of the CSV of wall-clock times, in µs."""
+        for seconds in _rows(list(self.timing.values())):
+            yield [f"{1e6 * value:.3f}" for value in seconds]
 
     def _table(self) -> tuple[list[str], Iterator[list[str]]]:
         """Header and rows of the CSV."""
         header = []
         for signal in self.signals.values():
-            header.append(f"{signal.name} [{signal.unit}]" if signal.unit else signal.name)
-        return [*header, STATUS], self._texts()
+            title = signal.name
+            if signal.unit:
+                title += f" [{signal.unit}]"
+            header.append(title)
+        header.append(STATUS)
+        return header, self._rows_of_text()
 
-    def _texts(self) -> Iterator[list[str]]:
+    def _rows_of_text(self) -> Iterator[list[str]]:
         """Rows of the CSV: each signal's value to the bit, and the status."""
-        counted = {kind.name for kind in SIGNALS if kind.whole}
-        is_whole = [name in counted for name in self.signals]
-        numbers = _rows([signal.values for signal in self.signals.values()])
-        for row, status in zip(numbers, self.status, strict=True):
-            cells = []
-            for value, whole in zip(row, is_whole, strict=True):
-                cells.append(repr(int(value)) if whole else repr(value))
-            yield [*cells, status]
+        whole_kinds = {kind.name for kind in SIGNALS if kind.whole}
+        whole_columns = []
+        columns = []
+        for index, (name, signal) in enumerate(self.signals.items()):
+            columns.append(signal.values)
+            if name in whole_kinds:
+                whole_columns.append(index)
+        for numbers, status in zip(_rows(columns), self.status, strict=True):
+            # `repr` is the shortest text that reads back to the same bits.
+            cells = [repr(number) for number in numbers]
+            for index in whole_columns:
+                cells[index] = repr(int(numbers[index]))
+            cells.append(status)
+            yield cells
 
 
 def _write(
@@ -346,7 +376,8 @@ def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:
     # A part at a time: a number of Python's takes four times the memory of NumPy's.
     for first in range(0, n_rows, ROWS_AT_ONCE):
         end = first + ROWS_AT_ONCE
-        yield from zip(*(column[first:end].tolist() for column in columns), strict=True)
+        part = [column[first:end].tolist() for column in columns]
+        yield from zip(*part, strict=True)
 
 
 def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:
@@ -380,25 +411,29 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
     # Another table, or a file that was cut after its header.
     if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
-    header = rows[0]
-    body = rows[1:]
-    values = np.empty((len(body), len(header) - 1))
-    # The header is line 1.
-    for line, row in enumerate(body, start=2):
+    header, *body = rows
+    *titles, _ = header
+    values = np.empty((len(body), len(titles)))
+    status = []
+    for index, row in enumerate(body):
+        # The header is line 1.
+        line = index + 2
         if len(row) != len(header):
             raise TrajectoryError(f"'{path}', line {line}: {len(row)} fields, not {len(header)}")
+        *cells, word = row
+        status.append(word)
         try:
-            values[line - 2] = _numbers_of_row(row[:-1])
+            values[index] = _numbers_of_row(cells)
         except ValueError as error:
             raise TrajectoryError(f"'{path}', line {line}: {error}") from None
     signals: dict[str, Signal] = {}
-    for title, column in zip(header, values.T, strict=False):
+    for title, column in zip(titles, values.T, strict=True):
         name, _, unit = title.partition(" [")
         # The later one would replace the first without a word.
         if name in signals:
             raise TrajectoryError(f"'{path}' has two columns '{name}'")
         signals[name] = Signal(name, unit.removesuffix("]"), column.copy())
-    return signals, [row[-1] for row in body]
+    return signals, status
 
 
 def _numbers_of_row(cells: Sequence[str]) -> list[float]:

@@ -34,40 +34,46 @@ def compare(
     with output(json) as out_:
         from cosim import comparison
 
-        runs = comparison.load_run(a), comparison.load_run(b)
-        protect(run.name for run in runs)  # of a folder, the file in it
-        result = comparison.compare(
-            *runs, dict(map(_read_tolerance, tolerance or [])), relative=relative
-        )
+        first = comparison.load_run(a)
+        second = comparison.load_run(b)
+        # Of a folder the command line knows only the folder, not the file in it.
+        protect([first.name, second.name])
+        tolerances = dict(_read_tolerance(option) for option in tolerance or [])
+        result = comparison.compare(first, second, tolerances, relative=relative)
         differences = result.lines() or ["no signal differs by more than its tolerance"]
         if record is not None:
             from cosim.recording import record_overlay
 
-            about = "\n".join(["# A against B", "", *(f"- {text}" for text in differences)])
-            overlaid = {f"A: {runs[0].label}": runs[0], f"B: {runs[1].label}": runs[1]}
+            items = [f"- {text}" for text in differences]
+            about = "\n".join(["# A against B", "", *items])
+            # Two runs may have one label.
+            overlaid = {f"A: {first.label}": first, f"B: {second.label}": second}
             record_overlay(record, overlaid, about)
             out_.note(f"both runs are overlaid in {record.resolve()}")
-        rows = [
-            (
-                d.name,
-                d.unit,
-                f"{d.maximum:.6g}",
-                str(d.at) if d.maximum > 0 else "",
-                "every bit" if d.tolerance is None else f"{d.tolerance:.6g}",
-                "" if d.first is None else str(d.first),
+        rows = []
+        for difference in result.differences:
+            allowed = difference.tolerance
+            row = (
+                difference.name,
+                difference.unit,
+                f"{difference.maximum:.6g}",
+                str(difference.at) if difference.maximum > 0 else "",
+                "every bit" if allowed is None else f"{allowed:.6g}",
+                "" if difference.first is None else str(difference.first),
             )
-            for d in result.differences
-        ]
+            rows.append(row)
         header = ("signal", "unit", "largest difference", "at sample", "tolerance", "first beyond")
         out_.table(f"{a} against {b}, {min(result.samples)} samples", header, rows)
         out_.note("\n".join(differences))
         out_.json(result.document())
+    # As `diff` does it, so that a script need not read the table.
     if not result.equal:
         raise typer.Exit(1)
 
 
 def _read_tolerance(option: str) -> tuple[str, float]:
     """Signal and tolerance of an option NAME=VALUE."""
+    # The last sign: a signal's name may hold one.
     name, _, value = option.rpartition("=")
     try:
         return name, float(value)

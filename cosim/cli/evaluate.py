@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from itertools import compress
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,10 +48,15 @@ def evaluate(
         if trajectories is not None:
             _evaluate_trajectories(task, trajectories, cli.open_folder(out), out_)
             return
-        names = [name for text in controllers for name in text.split(",") if name.strip()]
+        names = []
+        for text in controllers:
+            names += [name for name in text.split(",") if name.strip()]
         named = named_controllers(names)
+        # The command that makes the same numbers anew, for whoever finds the files.
         words = ["--scenario", scenario, "--controllers", ",".join(names), "--seeds", str(seeds)]
-        words += ["--first-seed", str(first_seed)] * (first_seed > 0) + ["--steps", str(steps)]
+        if first_seed > 0:
+            words += ["--first-seed", str(first_seed)]
+        words += ["--steps", str(steps)]
         folder = cli.open_folder(out)
         out_.announce(task.plant.fmu)
         evaluation = cosim.evaluate(
@@ -64,6 +70,7 @@ def evaluate(
             command=shlex.join(["cosim", "evaluate", *words]),
         )
         summary = evaluation.summary()
+        # All files or none: a table and a summary in a folder are of one evaluation.
         with staged(folder, EVALUATION_FILES) as stage:
             evaluation.write_files(stage)
             cli.write_summary(stage, summary)
@@ -75,22 +82,25 @@ def evaluate(
 def _evaluate_trajectories(
     scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output
 ) -> None:
+    """Recompute the costs of loops that another tool ran; print and write them."""
     from cosim.core.statistics import mean, regret, shown
     from cosim.evaluation import EVALUATION_FILES, judge
 
     table = judge(scenario, trajectories)
-    cost, optimum = table["J"].to_numpy(), table["optimum"].to_numpy()
-    rows = [
-        (row.file, str(row.seed), str(row.steps), shown(row.J, digits=6), f"{100 * row.regret:.3f}")
-        for row in table.itertuples()
-    ]
+    cost = table["J"].to_numpy()
+    optimum = table["optimum"].to_numpy()
+    violating_share = table["violating_share"].mean()
+    rows = []
+    for run in table.itertuples():
+        percent = f"{100 * run.regret:.3f}"
+        rows.append((run.file, str(run.seed), str(run.steps), shown(run.J, digits=6), percent))
     summary = {
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,
         "seeds": table["seed"].tolist(),
         "J": mean(cost)._asdict(),
         "regret": regret(cost, optimum)._asdict(),
-        "violating_share": float(table["violating_share"].mean()),
+        "violating_share": float(violating_share),
     }
     with staged(folder, EVALUATION_FILES) as stage:
         write_atomically(stage / "judged.csv", table.to_csv(index=False))
@@ -109,6 +119,7 @@ def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
     rows = []
     for name, row in summary["controllers"].items():
         timing = summary["timing"][name]
+        # What the controller takes of a sample; the plant's time is no merit of it.
         step = timing["prepare_median_us"] + timing["feedback_median_us"]
         rows.append(
             (
@@ -122,10 +133,11 @@ def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
             )
         )
     # A column that is known of no controller is left out.
-    kept = [k for k in range(len(header)) if any(row[k] for row in rows)]
-    lines = [[row[k] for k in kept] for row in rows]
-    title = f"{summary['scenario']}, {summary['steps']} samples"
-    output.table(f"{title} × {len(summary['seeds'])} seeds", [header[k] for k in kept], lines)
+    known = [any(cells) for cells in zip(*rows, strict=True)]
+    lines = [list(compress(row, known)) for row in rows]
+    n_seeds = len(summary["seeds"])
+    title = f"{summary['scenario']}, {summary['steps']} samples × {n_seeds} seeds"
+    output.table(title, list(compress(header, known)), lines)
     if "remark" in summary:
         output.note(summary["remark"])
     if summary["optimum"] is not None:
@@ -134,10 +146,11 @@ def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
             f"{shown(summary['optimal_J'], digits=6)}"
         )
     pairs = []
-    for row in summary["comparisons"]:
-        pair = f"{row['controller']} − {row['reference']}"
-        gain = _interval(row["gain_in_J"], 100.0)
-        pairs.append((pair, _interval(row["differences"]["J"]), gain))
+    for comparison in summary["comparisons"]:
+        pair = f"{comparison['controller']} − {comparison['reference']}"
+        difference = _interval(comparison["differences"]["J"])
+        gain = _interval(comparison["gain_in_J"], 100.0)
+        pairs.append((pair, difference, gain))
     if pairs:
         output.table(
             "paired comparisons (95 % interval over seeds)",

@@ -44,24 +44,34 @@ def new(
         from cosim.core.errors import CosimError
         from cosim.core.files import write_atomically
 
-        if not re.fullmatch(r"[a-z]\w*", name, re.ASCII | re.IGNORECASE) or iskeyword(name):
+        is_word = re.fullmatch(r"[a-z]\w*", name, re.ASCII | re.IGNORECASE)
+        if not is_word or iskeyword(name):
             raise CosimError(f"'{name}' is no name of a module: letters, digits and _, no keyword")
-        names = {"NAME": name, "CLASS": re.sub("(?:^|_)(.?)", lambda m: m[1].upper(), name)}
+        # my_rule names the class MyRule.
+        class_name = re.sub("(?:^|_)(.?)", lambda initial: initial[1].upper(), name)
 
-        def filled(text: str) -> str:
+        def fill_in(text: str) -> str:
+            # In one pass: the user's name may itself hold CLASS.
+            names = {"NAME": name, "CLASS": class_name}
             return re.sub("NAME|CLASS", lambda match: names[match[0]], text)
 
-        files = {
-            out / filled(path.name).removesuffix(".in"): filled(path.read_text("utf-8"))
-            for path in sorted((SKELETONS / kind).iterdir())
-        }
-        if there := next(filter(Path.exists, files), None):
-            raise CosimError(f"'{there}' is there already: give another name, or use --out")
+        files = {}
+        for skeleton in sorted((SKELETONS / kind).iterdir()):
+            # The suffix keeps tools that look for Python modules from taking skeletons for some.
+            file_name = fill_in(skeleton.name).removesuffix(".in")
+            files[out / file_name] = fill_in(skeleton.read_text("utf-8"))
+        for file in files:
+            if file.exists():
+                raise CosimError(f"'{file}' is there already: give another name, or use --out")
+        # The other module would be imported in place of the new one.
         if kind != "study" and find_spec(name):
             raise CosimError(f"there is a Python module '{name}' already: give another name")
         cli.writable_folder(out)
-        for path, text in files.items():
-            write_atomically(path, text)
-        commands = [f"cd {quote(str(out))}"] * (out != Path()) + [*map(filled, NEXT[kind])]
-        out_.note("\n".join([f"written: {', '.join(map(str, files))}", "next:", *commands]))
-        out_.json({"files": list(map(str, files)), "next": commands})
+        for file, text in files.items():
+            write_atomically(file, text)
+        commands = [fill_in(command) for command in NEXT[kind]]
+        if out != Path():
+            commands = [f"cd {quote(str(out))}", *commands]
+        written = [str(file) for file in files]
+        out_.note("\n".join([f"written: {', '.join(written)}", "next:", *commands]))
+        out_.json({"files": written, "next": commands})

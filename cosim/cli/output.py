@@ -20,6 +20,9 @@ from cosim.core.files import write_atomically
 from cosim.core.processes import Terminated, hold, redirected_output, release
 from cosim.core.training_options import MOST
 
+LONG_DOCUMENT = 1 << 20
+"""Bytes from which on a JSON document is written on one line: what is indented Python writes."""
+
 
 def count(*names: str, text: str | None = None) -> Any:
     """An option that is a number of samples."""
@@ -33,9 +36,15 @@ def descriptions(documented: object, section: str) -> dict[str, str]:
         documented: what has the docstring.
         section: heading of the section, `Args` or `Attributes`.
     """
-    entries = (getdoc(documented) or "").partition(f"\n\n{section}:\n")[2]
-    found = re.findall(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", entries, re.DOTALL | re.MULTILINE)
-    return {name: " ".join(words.split()) for name, words in found}
+    # None where Python drops docstrings (`python -OO`).
+    docstring = getdoc(documented) or ""
+    _, _, entries = docstring.partition(f"\n\n{section}:\n")
+    # `name: words`, up to the next name at the same indentation; the words may go over lines.
+    entry = re.compile(r"^ {4}(\w+): (.+?)(?=\n {4}\w|\Z)", re.DOTALL | re.MULTILINE)
+    texts = {}
+    for name, words in entry.findall(entries):
+        texts[name] = " ".join(words.split())
+    return texts
 
 
 ScenarioOption = Annotated[
@@ -58,6 +67,8 @@ JsonOption = Annotated[
 ]
 
 
+# A command's tables, its remarks and its JSON all go through this class, so that no command has to
+# ask for each line whether it may print it.
 class Output:
     """Tables go to standard output, progress to standard error; with JSON, only JSON goes out."""
 
@@ -73,7 +84,8 @@ class Output:
     def note(self, text: str) -> None:
         """Print a line on standard error, above a bar, unless JSON was asked for."""
         if not self.as_json:
-            print(text, file=sys.stderr)  # which a bar that is being drawn turns to itself
+            # A bar that is being drawn turns standard error to itself.
+            print(text, file=sys.stderr)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print a table, columns of numbers right justified and the others left.
@@ -104,25 +116,31 @@ class Output:
         for part in _fitting_tables(widths, console.width - 1):
             table = Table(title=escape(title), title_justify="left", min_width=len(title))
             for number in part:
-                numbers = all(_is_number(cell) for cell in columns[number])
-                justify: Any = "right" if numbers else "left"
+                is_numeric = all(_is_number(cell) for cell in columns[number])
+                justify: Any = "right" if is_numeric else "left"
                 table.add_column(escape(header[number]), justify=justify, overflow="fold")
             for row in rows:
-                shown = [escape(row[number]) for number in part]
-                table.add_row(*shown)
+                # Rich would read `[X2]` as a style.
+                cells = [escape(row[number]) for number in part]
+                table.add_row(*cells)
             console.print(table)
 
     def json(self, document: Mapping[str, Any]) -> None:
         """Print the document if JSON was asked for."""
-        if self.as_json and self._stdout is not None:
-            os.write(self._stdout, dump(document).encode())
-        elif self.as_json:
-            sys.stdout.write(dump(document))
+        if not self.as_json:
+            return
+        text = dump(document)
+        if self._stdout is None:
+            sys.stdout.write(text)
+        else:
+            # Standard output itself is turned away from native code meanwhile (`output`).
+            os.write(self._stdout, text.encode())
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, unless it is a shipped one."""
         from cosim.plant.fmi import SHIPPED_FMUS, unpack
 
+        # A shipped one is built from the sources of this package.
         if fmu not in SHIPPED_FMUS:
             unpacked = unpack(fmu)
             self.note(f"native code of {unpacked.path}, sha256 {unpacked.sha256}")
@@ -130,6 +148,7 @@ class Output:
 
 def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:
     """Columns by table, so that each table fits the room if it can; all have the first column."""
+    # Little would fit beside such a first column.
     if widths[0] > room / 2:
         return [list(range(len(widths)))]
     tables = [[0]]
@@ -147,6 +166,7 @@ def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:
 
 def _is_number(cell: str) -> bool:
     """Whether a cell begins with a number, or is empty."""
+    # An interval stands behind its value: `1.2 [1.1, 1.3]`.
     try:
         float(cell.split(maxsplit=1)[0].strip("()[],"))
     except (IndexError, ValueError):
@@ -162,7 +182,8 @@ def output(as_json: bool) -> Iterator[Output]:
     is native code that may print.
     """
     result = Output(as_json)
-    with redirected_output() if as_json else nullcontext(None) as result._stdout:
+    redirection = redirected_output() if as_json else nullcontext(None)
+    with redirection as result._stdout:
         try:
             yield result
         finally:
@@ -179,7 +200,9 @@ def resumable(
     try:
         yield
     except (KeyboardInterrupt, Terminated) as error:
-        if words := how():
+        words = how()
+        # `main` prints the notes behind "interrupted", when all is unwound.
+        if words:
             error.add_note(words)
         raise
 
@@ -208,9 +231,12 @@ def dump(document: Mapping[str, Any]) -> str:
     """JSON text with sorted keys, on one line if long; non-finite numbers become null."""
     from pydantic_core import to_json
 
+    # Pydantic's knows NumPy's numbers and paths, Python's sorts the keys.
     text = to_json(dict(document), inf_nan_mode="null")
-    indent = 2 if len(text) < 1 << 20 else None  # C code writes a line, Python what is indented
-    return json.dumps(json.loads(text), indent=indent, sort_keys=True) + "\n"
+    plain = json.loads(text)
+    is_long = len(text) >= LONG_DOCUMENT
+    indent = None if is_long else 2
+    return json.dumps(plain, indent=indent, sort_keys=True) + "\n"
 
 
 def open_folder(folder: Path) -> Path:
@@ -224,14 +250,17 @@ def open_folder(folder: Path) -> Path:
 
 def split_names(text: str) -> list[str]:
     """Words of a comma-separated option; a comma in brackets or quotes is a name's: `A[1,2]`."""
+    # Quoted, in brackets or in parentheses; else any sign but a comma.
     words = re.findall(r"(?:'[^']*'|\[[^\]]*\]|\([^)]*\)|[^,])+", text)
-    return [word.strip() for word in words if word.strip()]
+    stripped = [word.strip() for word in words]
+    return [word for word in stripped if word]
 
 
 def writable_folder(folder: Path) -> Path:
     """Create a folder and make sure, before the work, that it can be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # Permissions do not tell all: a disk may be full, or mounted for reading alone.
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".cosim-"):
             pass
     except (OSError, ValueError) as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from json import dumps
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +20,8 @@ class ShowByDefault(TyperGroup):
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
         """Put `show` first where no command is named."""
-        if not args or (args[0] not in self.commands and args[0] not in ctx.help_option_names):
+        known = {*self.commands, *ctx.help_option_names}
+        if not args or args[0] not in known:
             args = ["show", *args]
         return super().parse_args(ctx, args)
 
@@ -47,31 +47,45 @@ def show_scenario(
         from cosim.core.scenario import presets
 
         if name is None:
-            loaded = [cosim.Scenario.load(preset) for preset in presets()]
-            rows = [(item.name, item.hash, item.description) for item in loaded]
+            rows = []
+            hashes = {}
+            for preset in presets():
+                loaded = cosim.Scenario.load(preset)
+                rows.append((loaded.name, loaded.hash, loaded.description))
+                hashes[loaded.name] = loaded.hash
             out_.table("presets", ("name", "hash", "description"), rows)
-            out_.json({"presets": {item.name: item.hash for item in loaded}})
+            out_.json({"presets": hashes})
             return
         chosen = cosim.Scenario.load(name)
         if seed is not None:
             values = _seed_values(chosen, seed)
-            out_.note("\n".join(f"{key} = {dumps(value)}" for key, value in values.items()))
+            # As JSON, so that a Boolean is `true` as in the FMU, not `True`.
+            lines = [f"{key} = {dumps(value)}" for key, value in values.items()]
+            out_.note("\n".join(lines))
             out_.json({"hash": chosen.hash, "seed": seed, "start_values": values})
             return
         if json:
             out_.json(chosen.to_dict() | {"hash": chosen.hash})
         else:
+            # The hash is a comment: what is printed is a scenario file.
             print(f"# hash {chosen.hash}\n{chosen.to_toml()}", end="")
 
 
 def _seed_values(scenario: cosim.Scenario, seed: int) -> dict[str, float | bool | int]:
+    """Start values of the plant's FMU for a run of this seed, by name, in their own types."""
     from cosim.core.simulation import spawn_seeds
     from cosim.plant.wiring import REALS, start_values
 
-    types: dict[str, Callable[[float], float | bool | int]] = dict.fromkeys(REALS, float)
-    types["Boolean"] = bool
-    starts = start_values(scenario, spawn_seeds(seed)[0])
-    return {name: types.get(kind, int)(value) for name, (kind, value) in starts.items()}
+    plant_seed, _ = spawn_seeds(seed)
+    values: dict[str, float | bool | int] = {}
+    for name, (kind, value) in start_values(scenario, plant_seed).items():
+        if kind in REALS:
+            values[name] = float(value)
+        elif kind == "Boolean":
+            values[name] = bool(value)
+        else:
+            values[name] = int(value)
+    return values
 
 
 @scenario_app.command("init")
@@ -107,7 +121,9 @@ def draft(
     with cli.output(json) as out_:
         from cosim.plant.draft import NO_NOISE, draft_scenario
 
-        target = (out or Path(f"{Path(fmu).stem}.toml")).absolute()
+        by_default = Path(f"{Path(fmu).stem}.toml")
+        # Absolute, since an FMU may change the working directory.
+        target = (out or by_default).absolute()
         if target.exists() and not overwrite:
             raise CosimError(
                 f"'{target}' is there already; replace it by --overwrite, or use --out"
@@ -123,10 +139,12 @@ def draft(
             state=_numbers(state, "--state"),
             action=_numbers(action, "--action"),
         )
+        # Whether the model is accurate is known only of a scenario that is valid.
         drafted = _parsed_scenario(text, target)
         if drafted.controller.model is not None:
             text = _with_enough_substeps(text, drafted)
         write_atomically(target, text)
+        # As any later command reads it.
         drafted = cosim.Scenario.load(target)
         if not json:
             print(text, end="")
@@ -143,7 +161,9 @@ def _parsed_scenario(text: str, target: Path) -> cosim.Scenario:
     from cosim.core.scenario import resolved
 
     where = f"the draft of '{target}'"
-    return cosim.Scenario.from_dict(resolved(loads(text), where, target.parent), where)
+    # Its paths are relative to the folder in which it will lie.
+    document = resolved(loads(text), where, target.parent)
+    return cosim.Scenario.from_dict(document, where)
 
 
 def _with_enough_substeps(text: str, scenario: cosim.Scenario) -> str:

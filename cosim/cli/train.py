@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 def _as_option(name: str, kind: Any) -> Any:
     """Annotation of the command's option that is the field `name` of `TrainingOptions`."""
     limits = option_ranges().get(name)
-    least = None if limits is None else limits.least
-    most = None if limits is None else limits.most
+    least = limits.least if limits else None
+    most = limits.most if limits else None
     # None where Python drops docstrings (`python -OO`).
     text = cli.descriptions(TrainingOptions, "Attributes").get(name)
     return Annotated[kind, typer.Option(min=least, max=most, help=text)]
@@ -66,6 +66,7 @@ def train(
         from learning.training_run import make_run
         from learning.verdict import WORSE
 
+        # Neither a scenario nor a folder is needed to explain a rule.
         rule = load_algorithm(algorithm)
         if explain:
             _explain(algorithm, rule.Configuration.documentation(), out_)
@@ -79,6 +80,7 @@ def train(
         )
         folder = cli.open_folder(out)
         there = [name for name in TRAINING_FILES if (folder / name).exists()]
+        # A training may have taken hours: it is replaced by an order alone.
         if there and not (resume or overwrite):
             raise CosimError(
                 f"folder '{folder}' holds another training ({there[0]}); go on with it by "
@@ -88,8 +90,10 @@ def train(
         checkpoint = folder / CHECKPOINT
 
         def how() -> str:
-            go_on = f"the same command with --resume goes on from {checkpoint}"
-            return go_on if checkpoint.is_file() else ""
+            # An interruption may come before the first checkpoint.
+            if not checkpoint.is_file():
+                return ""
+            return f"the same command with --resume goes on from {checkpoint}"
 
         with cli.resumable(how):
             best = stored_optimum(run.scenario)
@@ -99,11 +103,14 @@ def train(
                 "no held-out runs, so that nothing says whether θ became better; evaluate it, or "
                 "give --evaluation-steps and --evaluation-seeds"
             )
-        if reason := training.without_checkpoint:
+        reason = training.without_checkpoint
+        if reason:
             out_.note(f"left no checkpoint, --resume is not possible: {reason}")
         timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
         summary = training.summary() | {"timing": timing}
-        with staged(folder, set(TRAINING_FILES) - {CHECKPOINT}) as stage:
+        # The checkpoint was written during the training, and stays.
+        files_of_this_run = set(TRAINING_FILES) - {CHECKPOINT}
+        with staged(folder, files_of_this_run) as stage:
             training.write_files(stage)
             if gif:
                 training.animate(stage / "learning.gif")
@@ -115,11 +122,13 @@ def train(
         _show_training(summary, out_)
         out_.note(f"the learning curve is {folder / 'learning.png'}")
         out_.json(summary)
+    # All files are written before: a script that sees the code can read why.
     if training.status != "finished" or training.verdict == WORSE:
         raise typer.Exit(1)
 
 
 def _explain(algorithm: str, hyperparameters: Sequence[Hyperparameter], output: cli.Output) -> None:
+    """Print a rule's hyperparameters."""
     header = ("name", "default", "allowed", "meaning")
     output.table(f"hyperparameters of {algorithm}", header, hyperparameters)
     document = {}
@@ -135,11 +144,11 @@ def _or_none(value: float | None) -> str:
 
 
 def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
+    """Print what a training came to; what is not known of it is left out."""
     from cosim.core.statistics import shown
 
-    title = (
-        "{algorithm} ({requires}) on {scenario}, {samples} samples, seed {seed}: {status}"
-    ).format(**summary)
+    form = "{algorithm} ({requires}) on {scenario}, {samples} samples, seed {seed}: {status}"
+    title = form.format(**summary)
     rows = [("verdict", summary["verdict"])]
     if summary["evaluation_seeds"]:
         difference = shown(summary["difference"], summary["difference_interval"], 1, 3)
@@ -161,8 +170,10 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
         ("plant samples", str(summary["plant_samples"])),
         ("plant samples of held-out runs, beside", str(summary["held_out_samples"])),
     ]
+    # Both need an optimum of the scenario, which `cosim optimum` stores.
     if summary["regret"] is not None:
-        rows.append(("regret %", shown(summary["regret"], summary["regret_interval"], 100, 3)))
+        regret = shown(summary["regret"], summary["regret_interval"], 100, 3)
+        rows.append(("regret %", regret))
     if summary["gap_closed"] is not None:
         gap = shown(summary["gap_closed"], None, 100, 4)
         rows.append(("share of the start's regret that is gone, %", gap))

@@ -153,7 +153,10 @@ class BackOffSearch:
     @property
     def trial(self) -> Parameters:
         """θ of the present segment; the best one when the search has ended."""
-        return self.theta if self.has_ended else self.backed_off(self._candidates[self._segment])
+        if self.has_ended:
+            return self.theta
+        kappa = self._candidates[self._segment]
+        return self.backed_off(kappa)
 
     @property
     def seed(self) -> int:
@@ -163,8 +166,10 @@ class BackOffSearch:
     def backed_off(self, kappa: Vector) -> Parameters:
         """θ with its bounds κ (2n,) backed off, within the true bounds, x_l kept below x_u."""
         n = self._n
-        lower = self.start["x_l"] + kappa[:n] * self._unit
-        upper = self.start["x_u"] - kappa[n:] * self._unit
+        of_lower = kappa[:n] * self._unit
+        of_upper = kappa[n:] * self._unit
+        lower = self.start["x_l"] + of_lower
+        upper = self.start["x_u"] - of_upper
         lower = np.maximum(lower, self._true_lower)
         upper = np.minimum(upper, self._true_upper)
         crossed = lower >= upper
@@ -184,14 +189,18 @@ class BackOffSearch:
             Whether it was the segment's last; `trial` is the next one's then.
         """
         if transition is not None:
-            s = transition.s.tolist()
-            a = transition.a.tolist()
-            next_s = transition.next_s.tolist()
-            row = [self._count, transition.stage_cost, *s, *a, *next_s]
+            row = [
+                self._count,
+                transition.stage_cost,
+                *transition.s.tolist(),
+                *transition.a.tolist(),
+                *transition.next_s.tolist(),
+            ]
             self._rows.append(row)
             # Which bounds are active is found in the first round alone.
             if self._round == 0:
-                multipliers = transition.solution.value_gradient[self._bounds]
+                gradient = transition.solution.value_gradient
+                multipliers = gradient[self._bounds]
                 self._n_active += multipliers != 0
         self._count += 1
         if self._count < self._length:
@@ -209,12 +218,14 @@ class BackOffSearch:
         self.led_beyond = False
         rows = np.array(self._rows).reshape(-1, self._n_columns)
         if self._round == 0:
-            self._active = np.maximum(self._active, self._n_active / self._length)
+            share = self._n_active / self._length
+            self._active = np.maximum(self._active, share)
         if not self._schedule:
             length = self._begin_schedule(rows)
         else:
             bound, _ = self._schedule[self._round]
-            self._keep(rows, self._candidates[self._segment, bound])
+            kappa = self._candidates[self._segment, bound]
+            self._keep(rows, kappa)
             length = self._length
         if self.has_ended:
             return
@@ -233,9 +244,8 @@ class BackOffSearch:
             self.has_ended = True
             return 0
         n = self._n
-        states = rows[:, 2 : 2 + n]
-        actions = rows[:, 2 + n : -n]
-        next_states = rows[:, -n:]
+        m = self._n_columns - 2 - 2 * n
+        _, _, states, actions, next_states = np.split(rows, np.cumsum([1, 1, n, m]), axis=1)
         errors = self._model.errors(states, actions, next_states, self.start)
         self._unit = errors.std(axis=0)
         first = int(np.argmax(self._active))
@@ -247,10 +257,12 @@ class BackOffSearch:
 
     def _keep(self, rows: Matrix, kappa: float) -> None:
         """Keep the samples of a segment at κ once the loop has settled."""
-        settled = rows[rows[:, 0] >= self._settling]
+        number = rows[:, 0]
+        settled = rows[number >= self._settling]
         # Round and κ stand before the sample: slopes are taken within a round.
         label = np.full((len(settled), 2), (self._round, kappa))
-        cost_and_state = settled[:, 1 : 2 + self._n]
+        last = 2 + self._n
+        cost_and_state = settled[:, 1:last]
         kept = np.hstack([label, cost_and_state])
         self._tried = np.concatenate([self._tried, kept])
 
@@ -259,15 +271,7 @@ class BackOffSearch:
         bound, phase = self._schedule[self._round]
         self.kappa[bound], self.led_beyond = self._best(bound, phase)
         if self._round == 0:
-            active = self._active >= self.settings.active_share
-            for other in np.flatnonzero(active).tolist():
-                if other != bound:
-                    self._schedule += [
-                        [other, Phase.COARSE],
-                        [other, Phase.MEDIUM],
-                        [other, Phase.FINE],
-                    ]
-            self._schedule += [[bound, Phase.MEDIUM], [bound, Phase.FINE]]
+            self._schedule += self._later_rounds(bound)
         self._round += 1
         self._segment = 0
         if self._round == len(self._schedule):
@@ -277,12 +281,25 @@ class BackOffSearch:
         # The samples of the medium round count in the fine one too.
         if phase != Phase.FINE:
             self._tried = self._tried[:0]
-        shares = self.settings.round_shares
         # What the first round has left, over all rounds to come.
+        shares = self.settings.round_shares
+        left = self._shares - shares[Phase.COARSE]
         total = sum(shares[later] for _, later in self._schedule[1:])
-        left = (self._shares - shares[Phase.COARSE]) / total
-        length, self._candidates = self._round_at(bound, phase, left)
+        length, self._candidates = self._round_at(bound, phase, left / total)
         return length
+
+    def _later_rounds(self, first: int) -> list[list[int]]:
+        """The rounds after the coarse one of the first bound: those of the others, then its own."""
+        rounds: list[list[int]] = []
+        active = self._active >= self.settings.active_share
+        for bound in np.flatnonzero(active).tolist():
+            if bound != first:
+                rounds += [
+                    [bound, Phase.COARSE],
+                    [bound, Phase.MEDIUM],
+                    [bound, Phase.FINE],
+                ]
+        return [*rounds, [first, Phase.MEDIUM], [first, Phase.FINE]]
 
     def _round_at(
         self,
@@ -301,19 +318,26 @@ class BackOffSearch:
             Samples of each segment, and κ of all bounds in each, (S, 2n).
         """
         settings = self.settings
-        rounds = (settings.coarse_offsets, settings.medium_offsets, settings.fine_offsets)
+        rounds = (
+            settings.coarse_offsets,
+            settings.medium_offsets,
+            settings.fine_offsets,
+        )
         offsets = rounds[phase]
         share = settings.round_shares[phase]
         parts = self._shares * len(offsets)
-        steps = int(self._budget * left * share / parts)
+        wanted = int(self._budget * left * share / parts)
+        length = max(wanted, self._settling + 1)
+
         least = self._least(bound)
         back = max(least, -offsets[-1])
         if phase == Phase.COARSE and back < -1.0:
-            offsets = (0.0, back, back / 2)  # of a start that is backed off, look for less
+            # Of a start that is backed off, look for less.
+            offsets = (0.0, back, back / 2)
         candidates = np.tile(self.kappa, (len(offsets), 1))
         for row, offset in zip(candidates, offsets, strict=True):
             row[bound] = max(row[bound] + offset, least)
-        return max(steps, self._settling + 1), candidates
+        return length, candidates
 
     def _least(self, bound: int) -> float:
         """κ of the true bound; at most 0 if the start loosens no bound."""
@@ -338,14 +362,19 @@ class BackOffSearch:
             return float(self.kappa[bound]), False
         rounds = self._tried[:, 0]
         kappa = self._tried[:, 1]
-        costs = self._tried[:, 2]
-        states = self._tried[:, 3:]
-        slope = self._slopes(rounds, kappa, self._tried[:, 2:])
+        costs_and_states = self._tried[:, 2:]
+        costs = costs_and_states[:, 0]
+        states = costs_and_states[:, 1:]
+        slopes = self._slopes(rounds, kappa, costs_and_states)
+        cost_slope = slopes[0]
+        state_slopes = slopes[1:]
         # The state itself moves as its bound does.
         state = bound % n
         direction = 1 if bound < n else -1
-        slope[1 + state] = self._unit[state] * direction
-        reach = settings.reach * (2 if phase == Phase.COARSE else 1)
+        state_slopes[state] = self._unit[state] * direction
+        reach = settings.reach
+        if phase == Phase.COARSE:
+            reach = 2 * reach
         # Costs of different κ share their mean; what differs is estimated.
         mean = float(costs.mean())
 
@@ -353,9 +382,10 @@ class BackOffSearch:
             # Samples far away speak for another place of the state.
             distance = value - kappa
             near = np.abs(distance) < reach + settings.resolution / 2
-            moved = states[near] + np.outer(distance[near], slope[1:])
+            change_of_states = np.outer(distance[near], state_slopes)
+            moved = states[near] + change_of_states
             penalty = known_penalty(self._penalty, moved).mean()
-            return float(slope[0] * value + penalty)
+            return float(cost_slope * value + penalty)
 
         def best_of(values: Vector) -> float:
             changes = [change(value) for value in values]
@@ -374,7 +404,8 @@ class BackOffSearch:
         last = np.floor(high / settings.resolution)
         grid = settings.resolution * np.arange(first, last + 1)
         best = best_of(grid)
-        if best == grid[-1] or (best == grid[0] and low > least):
+        falls_at_low_end = best == grid[0] and low > least
+        if best == grid[-1] or falls_at_low_end:
             return best_of(np.unique(kappa)), True
         return best, False
 
@@ -388,9 +419,10 @@ class BackOffSearch:
         above = np.zeros(values.shape[1])
         below = 0.0
         for number in np.unique(rounds):
-            inside = rounds == number
             # Least squares within the round: rounds meet different noise.
-            centred = kappa[inside] - kappa[inside].mean()
+            inside = rounds == number
+            of_round = kappa[inside]
+            centred = of_round - of_round.mean()
             above += centred @ values[inside]
             below += float(centred @ centred)
         return np.asarray(above / below if below > 0 else above)
@@ -446,7 +478,11 @@ class BackOff(Algorithm):
         super().__init__(*arguments)
         start = self.controller.parameters
         self._search = BackOffSearch(
-            start, self.scenario, self.samples, self.rng, self.configuration
+            start,
+            self.scenario,
+            self.samples,
+            self.rng,
+            self.configuration,
         )
         self.controller.theta = self._search.trial.theta
 
@@ -462,7 +498,8 @@ class BackOff(Algorithm):
         old = self.controller.theta
         new = self._search.trial
         self.controller.theta = new.theta
-        return update_without_fit(new.blocks, old, new.theta, refused=self._search.led_beyond)
+        refused = self._search.led_beyond
+        return update_without_fit(new.blocks, old, new.theta, refused=refused)
 
     def failed(self, cost: float) -> Update | None:
         """Count a sample at which the controller failed."""
@@ -492,8 +529,10 @@ def backed_off_by_errors(
         scenario: the true bounds.
         errors: e, (K, n).
     """
-    downwards = np.maximum(-errors.min(axis=0), 0.0)
-    upwards = np.maximum(errors.max(axis=0), 0.0)
+    lowest = errors.min(axis=0)
+    highest = errors.max(axis=0)
+    downwards = np.maximum(-lowest, 0.0)
+    upwards = np.maximum(highest, 0.0)
     lower = scenario.state_lower + downwards
     upper = scenario.state_upper - upwards
     crossed = lower >= upper

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import isnan
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,15 +95,17 @@ class BatchQLearning(ValueRule):
         failures = 0
         information = self._information
         for _ in range(settings.relinearisations):
-            solved, q, next_value, gradient = self._buffer.replay()
-            failures += len(solved) - len(q)
-            if not len(q):
+            replayed = self._buffer.replay()
+            solved = replayed.solved
+            failures += len(solved) - len(replayed.q)
+            if not len(replayed.q):
                 break
             cost = self._buffer.column("cost")[solved]
             correction = self._buffer.column("correction")[solved]
-            target = self._average_cost.target(cost, next_value)
+            gradient = replayed.gradient
+            target = self._average_cost.target(cost, replayed.next_value)
             # The next penalty is replaced by its expectation.
-            td_error = target - q + self._average_cost.discount * correction
+            td_error = target - replayed.q + self._average_cost.discount * correction
             if not np.isfinite(td_error).all():
                 raise DivergenceError("TD errors are not finite")
             # Once, from the first batch: noise, widths and c_f.
@@ -111,20 +113,22 @@ class BatchQLearning(ValueRule):
                 td_error = self._begin_filter(td_error)
             if settings.intercept:
                 td_error, gradient = self._average_cost.centre(td_error, gradient)
-            fit, information = self._posterior(td_error, gradient * self._step.scale)
+            scaled_gradient = gradient * self._step.scale
+            fit, information = self._posterior(td_error, scaled_gradient)
             fit = self._average_cost.absorb(fit)
-            error_size = float(np.sqrt(np.mean(td_error**2)))
-            update = self._step.apply(fit, error_size)
+            mean_square = np.mean(td_error**2)
+            update = self._step.apply(fit, float(np.sqrt(mean_square)))
         if update is None:
             raise DivergenceError("no transition of a batch can be replayed")
 
         # The posterior of this batch is the prior of the next.
         self._information = information
         self._mean = self._present
-        squares = np.minimum(td_error**2, settings.outlier * self._variance)
-        variance = float(squares.mean())
+        largest_square = settings.outlier * self._variance
+        squares = np.minimum(td_error**2, largest_square)
+        change = float(squares.mean()) - self._variance
         share = min(len(td_error) / settings.variance_memory, 1.0)
-        self._variance += share * (variance - self._variance)
+        self._variance += share * change
         return update._replace(failures=failures)
 
     def _posterior(self, td_error: Vector, gradient: Matrix) -> tuple[Fit, Matrix]:
@@ -135,21 +139,23 @@ class BatchQLearning(ValueRule):
             gradient: G, (K, n_θ), scaled.
         """
         settings = self.configuration
-        limit = settings.innovation_clip * self._variance**0.5
+        prior = self._information
+        variance = self._variance
+        limit = settings.innovation_clip * variance**0.5
         # As online: no single sample decides.
         innovation = np.clip(td_error, -limit, limit)
-        batch_information = gradient.T @ gradient / self._variance
-        information = self._information + batch_information
+        of_batch = gradient.T @ gradient / variance
+        information = prior + of_batch
         from_prior = self._present - self._mean
-        slope = gradient.T @ innovation / self._variance
-        slope -= self._information @ from_prior
+        slope = gradient.T @ innovation / variance
+        slope -= prior @ from_prior
         step = cho_solve(cho_factor(information), slope)
         fit = Fit(slope, step, information.copy)
         # Of a step that is too long only a share is taken, and that share of the information.
         largest = settings.largest_step or np.inf
-        longest = float(np.abs(fit.minimiser).max())
+        longest = float(np.abs(step).max())
         share = 1.0 / max(longest / largest, 1.0)
-        return fit.shrunk(share), self._information + share * batch_information
+        return fit.shrunk(share), prior + share * of_batch
 
     @property
     def _present(self) -> Vector:
@@ -167,7 +173,8 @@ class BatchQLearning(ValueRule):
             δ with that mean cost, (K,).
         """
         td_error = self._average_cost.begin(td_error + self._average_cost.mean_cost)
-        self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
+        mean_square = float(np.mean(td_error**2))
+        self._variance = max(mean_square, np.finfo(np.float64).tiny)
         states = self._buffer.column("s")
         errors = self._buffer.column("error")
         start = self._begin_with_prior(states, errors, self._variance**0.5)
@@ -198,6 +205,22 @@ class BatchQLearning(ValueRule):
         self._information = state["information"]
         self._mean = state["mean"]
         self._variance = state["variance"]
+
+
+class Replayed(NamedTuple):
+    """The values of a buffer's K transitions at the controller's θ.
+
+    Attributes:
+        solved: which of them could be solved, (K,) of bool; L of them.
+        q: Q(s, a) of these, (L,).
+        next_value: V(s₊), (L,).
+        gradient: ∇Q, unscaled, (L, n_θ).
+    """
+
+    solved: NDArray[np.bool_]
+    q: Vector
+    next_value: Vector
+    gradient: Matrix
 
 
 class ReplayBuffer:
@@ -266,7 +289,8 @@ class ReplayBuffer:
             array = np.asarray(value)
             # The first transition says how long its arrays are.
             if name not in self._columns:
-                self._columns[name] = np.zeros((self._capacity, *array.shape), array.dtype)
+                shape = (self._capacity, *array.shape)
+                self._columns[name] = np.zeros(shape, array.dtype)
             self._columns[name][row] = array
         if not self._controller.memoryless:
             return
@@ -277,21 +301,22 @@ class ReplayBuffer:
             self._q[row] = transition.solution.value
             self._gradient[row] = transition.solution.value_gradient
 
-    def replay(self) -> tuple[NDArray[np.bool_], Vector, Vector, Matrix]:
-        """Solve the transitions at the controller's θ.
-
-        Returns:
-            Which of the transitions could be solved, (K,) of bool; of these Q(s, a), V(s₊) and ∇Q
-            (unscaled), (L,), (L,) and (L, n_θ).
-        """
+    def replay(self) -> Replayed:
+        """Solve the transitions at the controller's θ."""
         self._forget_values_of_another_theta()
         q = self._q[: self.count]
         next_value = self._next_value[: self.count]
-        self._solve(np.flatnonzero(np.isnan(q + next_value)))
+        gradient = self._gradient[: self.count]
+        unknown = np.isnan(q + next_value)
+        self._solve(np.flatnonzero(unknown))
         # A QP that failed has left NaN.
         solved = np.isfinite(q) & np.isfinite(next_value)
-        gradient = self._gradient[: self.count]
-        return solved, q[solved], next_value[solved], gradient[solved]
+        return Replayed(
+            solved=solved,
+            q=q[solved],
+            next_value=next_value[solved],
+            gradient=gradient[solved],
+        )
 
     def _forget_values_of_another_theta(self) -> None:
         theta = self._controller.theta
@@ -306,12 +331,13 @@ class ReplayBuffer:
         # V(s₊) of one transition is Q of the next: a successor shares the linearisation, and where
         # it was greedy the solution too.
         controller = self._controller
-        states = self._columns["s"]
-        actions = self._columns["a"]
-        next_states = self._columns["next_s"]
+        columns = self._columns
+        states = columns["s"]
+        actions = columns["a"]
+        next_states = columns["next_s"]
         # Plain numbers: reading them one by one out of arrays costs as much as a gradient.
-        numbers = self._columns["number"][rows].tolist()
-        explored = self._columns["explored"][rows].tolist()
+        numbers = columns["number"][rows].tolist()
+        explored = columns["explored"][rows].tolist()
         prepared_for: int | None = None  # the sample whose linearisation the controller has
         solution: RtiSolution | None = None  # its greedy one, if known
         for number, exploring, row in zip(numbers, explored, rows.tolist(), strict=True):

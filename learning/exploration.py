@@ -78,9 +78,12 @@ class Strategy:
         """
         centres = self._centre(actions)
         # Without a deviation the censored normal is a point: a tiny one gives its limit.
-        sigma = np.maximum(self.deviation, np.finfo(float).tiny)
-        low = (self.lower - centres) / sigma
-        high = (self.upper - centres) / sigma
+        tiny = np.finfo(float).tiny
+        sigma = np.maximum(self.deviation, tiny)
+        to_lower = self.lower - centres
+        to_upper = self.upper - centres
+        low = to_lower / sigma
+        high = to_upper / sigma
         # Mean of min(max(c + e, lower), upper): the density at the bounds, and their tails.
         density_low = np.exp(-(low**2) / 2)
         density_high = np.exp(-(high**2) / 2)
@@ -91,4 +94,7 @@ class Strategy:
         return mean + (centres - actions)
 
     def _centre(self, action: Vector) -> Vector:
-        return np.zeros_like(action) if self.kind == "literal" else action
+        """Where the noise is added: c."""
+        if self.kind == "literal":
+            return np.zeros_like(action)
+        return action

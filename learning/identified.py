@@ -64,15 +64,18 @@ class Identified(Algorithm):
         self._model = OneStepModel(self.scenario)
         self._rows: list[list[float]] = []  # (s, a, s₊) since the last fit
         settings = self.configuration
-        shift = round(3600.0 * settings.shift_hours / self.scenario.sampling_time)
+        seconds = 3600.0 * settings.shift_hours
+        shift = round(seconds / self.scenario.sampling_time)
         self._every = settings.every or max(shift, 1)
 
     def observe(self, transition: Transition) -> Update | None:
         """Keep a transition; the last of a shift gives a new fit."""
-        s = transition.s.tolist()
-        a = transition.a.tolist()
-        next_s = transition.next_s.tolist()
-        self._rows.append([*s, *a, *next_s])
+        row = [
+            *transition.s.tolist(),
+            *transition.a.tolist(),
+            *transition.next_s.tolist(),
+        ]
+        self._rows.append(row)
         if len(self._rows) < self._every:
             return None
         old = self.controller.theta
@@ -97,8 +100,8 @@ class Identified(Algorithm):
         states = rows[:, :n]
         actions = rows[:, n:-n]
         next_states = rows[:, -n:]
-        fitted = present.replace({"p": self._fit(present, states, actions, next_states)})
-        tuned = self._tuned(fitted)
+        p = self._fit(present, states, actions, next_states)
+        tuned = self._tuned(present.replace({"p": p}))
         if not self.configuration.back_off:
             return tuned
         errors = self._model.errors(states, actions, next_states, tuned)
@@ -112,23 +115,25 @@ class Identified(Algorithm):
         next_states: Matrix,
     ) -> Vector:
         """p̂, (n_p,), by nonlinear least squares from the present p."""
+        model = self._problem.model
         labels = present.blocks.block("p").labels
-        indices = self._problem.model.parameter_indices(labels)
-        nominal = self._problem.model.nominal_parameters[indices]
+        indices = model.parameter_indices(labels)
+        nominal = model.nominal_parameters[indices]
         # Parameters in units of their values: one tolerance serves all.
         unit = np.where(nominal != 0, np.abs(nominal), 1.0)
-        sigma = self._model.errors(states, actions, next_states, present).std(axis=0)
+        errors_before = self._model.errors(states, actions, next_states, present)
         # An exact model has no errors to weigh by.
-        sigma = np.maximum(sigma, np.finfo(float).tiny)
+        sigma = np.maximum(errors_before.std(axis=0), np.finfo(float).tiny)
         values = self._model.parameters(present)
+        offset = present["c_f"]
 
-        def errors(scaled: Vector) -> Vector:
+        def weighted_errors(scaled: Vector) -> Vector:
             values[indices] = scaled * unit
-            predicted = self._model.predict(states, actions, values) + present["c_f"]
-            weighted = (next_states - predicted) / sigma
-            return np.asarray(weighted.reshape(-1))
+            predicted = self._model.predict(states, actions, values) + offset
+            errors = (next_states - predicted) / sigma
+            return np.asarray(errors.reshape(-1))
 
-        solution = least_squares(errors, present["p"] / unit)
+        solution = least_squares(weighted_errors, present["p"] / unit)
         return np.asarray(solution.x * unit)
 
     def _tuned(self, fitted: Parameters) -> Parameters:

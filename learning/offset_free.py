@@ -53,12 +53,13 @@ class OffsetFree(Algorithm):
 
     def observe(self, transition: Transition) -> Update | None:
         """Filter the error of one prediction; every `update_every`-th moves θ."""
-        predicted = self._model.predict(transition.s, transition.a, self._parameters)[0]
+        (predicted,) = self._model.predict(transition.s, transition.a, self._parameters)
         error = transition.next_s - predicted
         self._errors.add(error)
         # A running mean until the memory is full, exponential from then on.
         weight = 1.0 / len(self._errors.values)
-        self._offset = self._offset + weight * (error - self._offset)
+        innovation = error - self._offset
+        self._offset = self._offset + weight * innovation
         if self._errors.count % self.configuration.update_every:
             return None
         old = self.controller.theta
@@ -85,7 +86,10 @@ class OffsetFree(Algorithm):
 
     def state_dict(self) -> State:
         """The offset and the errors."""
-        return {"offset": self._offset, **prefixed("errors", self._errors.state_dict())}
+        return {
+            "offset": self._offset,
+            **prefixed("errors", self._errors.state_dict()),
+        }
 
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned."""

@@ -180,19 +180,26 @@ class ModelledPlant:
 
     def step(self, a: Array) -> Step:
         """Hold the action a (m,) for one sampling time."""
+        model = self._model
         number = self._number
         # As in C: the prediction first, the residual makes the next state.
         inputs = np.concatenate([self._s, a])
-        y, h = self._model.features.mean(self._s, a, self._c)
+        y, h_column = model.features.mean(self._s, a, self._c)
+        h = h_column.full()[:, 0]
+        nominal = y.full()[:, 0]
+        linear_part = self._W @ np.append(1.0, inputs)
+        persists = model.persistence @ self._error
+        predicted = nominal + linear_part + h * persists
         self.inputs[number] = inputs
-        self.h[number] = h.full()[:, 0]
-        persists = self._model.persistence @ self._error
-        predicted = y.full()[:, 0] + self._W @ np.append(1.0, inputs)
-        self.predicted[number] = predicted + self.h[number] * persists
-        residual = self._model.residuals[self._picks[number]]
+        self.predicted[number] = predicted
+        self.h[number] = h
+
+        pick = self._picks[number]
+        residual = model.residuals[pick]
         self._error = persists + residual
-        outcome = self.predicted[number] + self.h[number] * residual
+        outcome = predicted + h * residual
         self._s = outcome[:-1]
+        stage_cost = float(outcome[-1])
         self._number = number + 1
         # The penalty is a matter of whoever reads the table.
-        return Step(self._s, float(outcome[-1]), nan, residual)
+        return Step(self._s, stage_cost, nan, residual)

@@ -67,12 +67,10 @@ class _Predictor:
         model = problem.model
         x, u, d, p = model.symbols()
         rate = model.ode(x, u, d, p)
-        slope = ca.vec(ca.jacobian(rate, ca.vertcat(x, u)))
-        rates = ca.Function(
-            "rates",
-            [x, u, d, p],
-            [ca.densify(rate), ca.densify(slope)],
-        )
+        jacobian = ca.jacobian(rate, ca.vertcat(x, u))
+        slope = ca.vec(jacobian)
+        results = [ca.densify(rate), ca.densify(slope)]
+        rates = ca.Function("rates", [x, u, d, p], results)
         nominal_d = ca.SX(ca.DM(model.nominal_disturbance))
         nominal_p = ca.SX(ca.DM(model.nominal_parameters))
         at_nominal: Any = rates(x, u, nominal_d, nominal_p)
@@ -90,10 +88,11 @@ class _Predictor:
             The rates (P, n), and the derivatives (P, n, n+m).
         """
         count, n = x.shape
-        rates, slopes = (value.full().T for value in self._rates(x.T, u.T))
-        # CasADi stacks a derivative's columns.
-        by_columns = slopes.reshape(count, -1, n)
-        return rates, by_columns.transpose(0, 2, 1)
+        # CasADi has a point in each column, and stacks a derivative's columns.
+        rates, slopes = self._rates(x.T, u.T)
+        stacked = slopes.full().T
+        by_columns = stacked.reshape(count, -1, n)
+        return rates.full().T, by_columns.transpose(0, 2, 1)
 
     def modes(self, x: Matrix, u: Matrix) -> NDArray[np.complex128]:
         """Eigenvalues (P, n) of the rates' derivatives by x; 0 where these are not finite.
@@ -106,9 +105,10 @@ class _Predictor:
         _, slopes = self.slopes(x, u)
         by_state = slopes[:, :, :n]
         # An eigenvalue solver raises its own error on what is not finite.
-        finite: Mask = np.array(np.isfinite(by_state).all(axis=(1, 2)))
-        usable = np.where(finite[:, None, None], by_state, 0.0)
-        return np.linalg.eigvals(usable).astype(complex)
+        usable = by_state.copy()
+        usable[~_finite(by_state)] = 0.0
+        eigenvalues = np.linalg.eigvals(usable)
+        return eigenvalues.astype(complex)
 
     def __call__(self, x: Matrix, u: Matrix, substeps: int) -> Matrix:
         """x₊ and its derivatives by (x, u) side by side, (P, n, 1+n+m)."""
@@ -129,7 +129,8 @@ class _Predictor:
             by_state = slope[:, :, :n]
             by_action = slope[:, :, n:]
             variation = by_state @ jacobian + by_action @ held_jacobian
-            return np.concatenate([value[:, :, None], variation], axis=2)
+            column = value[:, :, None]
+            return np.concatenate([column, variation], axis=2)
 
         for _ in range(substeps):
             k1 = rate(state)
@@ -246,9 +247,16 @@ def _errors(
     at_corners = parts[1:, :, 0]
     errors = np.concatenate([at_reference, at_corners])
     errors = np.where(np.isfinite(errors), errors, np.inf)
-    finite: Mask = np.array(np.isfinite(finer).all(axis=(1, 2)))
     without_finer = np.where(grows, np.inf, 0.0)
+    finite = _finite(finer)
     return np.asarray(np.where(finite[:, None], errors, without_finer[:, None]))
+
+
+def _finite(values: Matrix) -> Mask:
+    """Whether all entries are finite, of each of P points (P, …)."""
+    by_point = values.reshape(len(values), -1)
+    finite: Mask = np.array(np.isfinite(by_point).all(axis=1))
+    return finite
 
 
 def _grows(modes: NDArray[np.complex128], h: float) -> Mask:

@@ -55,14 +55,19 @@ def remember(model: Model, memory: Memory, nominal: float, spread: float) -> Mod
     def realised(x: ca.SX, d: ca.SX) -> ca.SX:
         """Disturbances in their units: that of a sample is constant in it, as ξ and w are."""
         values = ca.vertsplit(d)
-        values[memory.disturbance] = nominal + spread * memory.next_value(x, d)
+        filtered = memory.next_value(x, d)
+        values[memory.disturbance] = nominal + spread * filtered
         return ca.vertcat(*values)
 
     def ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
-        return ca.vertcat(model.ode(x[:-1], u, realised(x, d), p), 0)
+        of_model = x[:-1]
+        rate = model.ode(of_model, u, realised(x, d), p)
+        # ξ is held within a sample.
+        return ca.vertcat(rate, 0)
 
     def economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
-        return model.economic_cost(x[:-1], u, realised(x, d), p)
+        of_model = x[:-1]
+        return model.economic_cost(of_model, u, realised(x, d), p)
 
     name = model.disturbances[memory.disturbance].name
     return Model(

@@ -942,10 +942,10 @@ def _residual(
         weight = next_discounts[k] * bounds[k].w
         soft_bound_error = _soft_bound_error(xi[k + 1], stage.lam / weight, bounds[k])
         errors.append(soft_bound_error)
-    return _largest(errors)
+    return _largest_entry(errors)
 
 
-def _largest(errors: Sequence[ca.SX]) -> ca.SX:
+def _largest_entry(errors: Sequence[ca.SX]) -> ca.SX:
     """The largest of all entries of these vectors."""
     entries = ca.vertsplit(ca.vertcat(*errors))
     largest = entries[0]

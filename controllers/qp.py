@@ -107,9 +107,11 @@ class QpSolution(NamedTuple):
         nearest = _projected(shifted, qp.row_lower, qp.row_upper)
         beyond = shifted - nearest
         charged = np.maximum(np.abs(beyond) - 1.0, 0.0)
-        violation = charged / (1 + 2 * qp.W / qp.w)
+        softness = 1 + 2 * qp.W / qp.w
+        violation = charged / softness
         proximal = nearest + np.copysign(violation, beyond)
-        rows = np.abs(y - proximal) / (1 + np.abs(y))
+        error = np.abs(y - proximal)
+        rows = error / (1 + np.abs(y))
 
         largest = max(
             stationarity.max(),
@@ -139,9 +141,10 @@ class QpSolution(NamedTuple):
 
         # A variable is about to leave its bound: it is there, and ν is zero.
         nu_size = np.abs(self.nu)
+        largest_nu = max(curvature, float(nu_size.max()))
         distance = np.minimum(v - qp.lower, qp.upper - v)
         at_bound = distance < tolerance * (1 + np.abs(v))
-        no_push = nu_size < tolerance * max(curvature, float(nu_size.max()))
+        no_push = nu_size < tolerance * largest_nu
         leaves_bound = free & at_bound & no_push
         if leaves_bound.any():
             return True
@@ -150,13 +153,16 @@ class QpSolution(NamedTuple):
         y = qp.rows @ v
         to_lower = np.abs(y - qp.row_lower)
         to_upper = np.abs(y - qp.row_upper)
-        at_limit = np.minimum(to_lower, to_upper) < tolerance * (1 + np.abs(y))
+        to_limit = np.minimum(to_lower, to_upper)
+        at_limit = to_limit < tolerance * (1 + np.abs(y))
         lam_size = np.abs(self.lam)
-        largest = np.maximum(curvature, lam_size.max(initial=0.0))
-        leaving = lam_size < tolerance * largest
-        yielding = np.abs(lam_size - qp.w) < tolerance * qp.w
-        effect = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0)
-        unmoved = ~(effect > 0)
+        largest_lam = max(curvature, float(lam_size.max(initial=0.0)))
+        leaving = lam_size < tolerance * largest_lam
+        to_w = np.abs(lam_size - qp.w)
+        yielding = to_w < tolerance * qp.w
+        # Of a row at its limit that no free variable moves the multiplier is not unique.
+        effects = np.abs(qp.rows[:, free])
+        unmoved = ~(effects.max(axis=1, initial=0.0) > 0)
         changes = at_limit & (leaving | yielding | unmoved)
         return bool(changes.any())
 
@@ -176,8 +182,10 @@ class QpSolution(NamedTuple):
 
         # λ/w is 0 within the limits, between 0 and 1 at one, above 1 beyond it.
         y = qp.rows @ v
+        below = qp.row_lower - y
+        above = y - qp.row_upper
+        outside = np.maximum(below, above)
         size = np.abs(self.lam) / qp.w
-        outside = np.maximum(qp.row_lower - y, y - qp.row_upper)
         shifted = size + outside
         violated = shifted > 1
         at_limit = ~violated & (shifted > 0)
@@ -190,7 +198,8 @@ class QpSolution(NamedTuple):
         """
         active = self.active(qp)
         free = ~active.at_bound
-        gradients = qp.rows[active.at_limit][:, free]
+        rows_at_limit = qp.rows[active.at_limit]
+        gradients = rows_at_limit[:, free]
         n_rows, n_free = gradients.shape
         if n_rows == 0:
             return np.inf
@@ -241,26 +250,30 @@ def multipliers_at_kink(
     x_1 = first_rows @ action
     to_lower = np.abs(x_1 - qp.row_lower[:n])
     to_upper = np.abs(x_1 - qp.row_upper[:n])
-    near = np.minimum(to_lower, to_upper) < KINK_TOLERANCE * (1 + np.abs(x_1))
+    to_limit = np.minimum(to_lower, to_upper)
+    near = to_limit < KINK_TOLERANCE * (1 + np.abs(x_1))
     if not near.any():
         return solution
 
     # ν + Γᵀλ is fixed by stationarity; what the rows do not take, −ν, is dQ/da.
-    kinked_rows = first_rows[near]
+    kinks = np.flatnonzero(near)
+    kinked_rows = first_rows[kinks]
     nu = solution.nu.copy()
     lam = solution.lam.copy()
-    total = nu[:m] + lam[:n][near] @ kinked_rows
+    total = nu[:m] + lam[kinks] @ kinked_rows
     width = KINK_TOLERANCE * (1 + np.abs(action))
-    inside = (action > lower + width) & (action < upper - width)
+    above_lower = action > lower + width
+    below_upper = action < upper - width
+    inside = above_lower & below_upper
     wanted, *_ = np.linalg.lstsq(kinked_rows[:, inside].T, total[inside])
 
     # λ is in [0, w] at an upper limit, in [−w, 0] at a lower one.
-    w = qp.w[:n][near]
-    at_upper = (to_upper < to_lower)[near]
+    w = qp.w[kinks]
+    at_upper = to_upper[kinks] < to_lower[kinks]
     lam_least = np.where(at_upper, 0, -w)
     lam_most = np.where(at_upper, w, 0)
     chosen = np.clip(wanted, lam_least, lam_most)
-    lam[:n][near] = chosen
+    lam[kinks] = chosen
     nu[:m] = total - chosen @ kinked_rows
     return QpSolution(solution.v, nu, lam)
 
@@ -285,14 +298,16 @@ def kkt_solve(
     Returns:
         The variables (k, d), and the multipliers of the rows at their limit (k, c), zero elsewhere.
     """
+    at_limit = active.at_limit
     free = ~active.at_bound
     rows = qp.rows[:, free]
-    equality_rows = rows[active.at_limit]
+    equality_rows = rows[at_limit]
     violated_rows = rows[active.violated]
     H = qp.H[free][:, free]
     if len(violated_rows):
         W = qp.W[active.violated]
-        H = H + 2 * (violated_rows.T * W) @ violated_rows
+        weighted_rows = violated_rows.T * W
+        H = H + 2 * weighted_rows @ violated_rows
 
     # [H Γᵀ; Γ 0] for the free variables and the rows at their limit; column-major, as LAPACK
     # wants it.
@@ -304,7 +319,7 @@ def kkt_solve(
     kkt[n_free:, :n_free] = equality_rows
     right = np.empty((size, len(seeds)), order="F")
     right[:n_free] = seeds[:, free].T
-    right[n_free:] = limits[:, active.at_limit].T
+    right[n_free:] = limits[:, at_limit].T
 
     answer = right
     if size:  # every variable may be at a bound
@@ -319,7 +334,7 @@ def kkt_solve(
     v = np.zeros(seeds.shape)
     v[:, free] = answer[:n_free].T
     lam = np.zeros(limits.shape)
-    lam[:, active.at_limit] = answer[n_free:].T
+    lam[:, at_limit] = answer[n_free:].T
     return v, lam
 
 
@@ -357,29 +372,32 @@ def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-12) -> QpSolut
 def _newton_step(qp: SoftQp, solution: QpSolution) -> QpSolution:
     """The KKT point of the solution's active set, whether or not it is the right one."""
     active = solution.active(qp)
+    at_bound = active.at_bound
+    violated = active.violated
 
     # The variables at a bound are known; those that are free are counted from zero.
     at_upper_bound = solution.nu > 0
     bound = np.where(at_upper_bound, qp.upper, qp.lower)
-    base = np.where(active.at_bound, bound, 0.0)
+    base = np.where(at_bound, bound, 0.0)
 
     # λ = ±w + 2W(Γv − limit) of a violated row: the first part is known, the second is curvature.
     above = solution.lam > 0
     limit = np.where(above, qp.row_upper, qp.row_lower)
     signed_w = np.where(above, qp.w, -qp.w)
-    push = np.where(active.violated, signed_w, 0.0)
-    weight = np.where(active.violated, 2 * qp.W, 0.0)
+    push = np.where(violated, signed_w, 0.0)
+    weight = np.where(violated, 2 * qp.W, 0.0)
 
     # Newton's step from `base`: stationarity in the free variables, rows at their limits met.
     excess = qp.rows @ base - limit
     base_lam = push + weight * excess
     gradient = qp.H @ base + qp.f + base_lam @ qp.rows
-    steps, lam_at_limit = kkt_solve(qp, active, -gradient[None], -excess[None])
-    v = base + steps[0]
-    lam = lam_at_limit[0] + push + weight * (qp.rows @ v - limit)
+    (step,), (lam_at_limit,) = kkt_solve(qp, active, -gradient[None], -excess[None])
+    v = base + step
+    excess = qp.rows @ v - limit
+    lam = lam_at_limit + push + weight * excess
     # What is left of the gradient is taken by the bounds.
     gradient = qp.H @ v + qp.f + lam @ qp.rows
-    nu = np.where(active.at_bound, -gradient, 0.0)
+    nu = np.where(at_bound, -gradient, 0.0)
     return QpSolution(v, nu, lam)
 
 
@@ -558,9 +576,9 @@ class QpsolversBackend:
         import qpsolvers  # noqa: PLC0415 - slow to import
 
         if solver not in qpsolvers.available_solvers:
+            installed = ", ".join(qpsolvers.available_solvers)
             raise ControllerError(
-                f"qpsolvers has no solver '{solver}' installed; "
-                f"it has {', '.join(qpsolvers.available_solvers)}"
+                f"qpsolvers has no solver '{solver}' installed; it has {installed}"
             )
         self._solver = solver
 
@@ -636,9 +654,10 @@ def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
     slack_unit = qp.H.diagonal().max() / qp.w
 
     # Cost of (v, τ).
+    slack_curvature = 2 * qp.W * slack_unit**2
     P = np.zeros((size, size))
     P[:variables, :variables] = qp.H
-    P[variables:, variables:] = np.diag(2 * qp.W * slack_unit**2)
+    P[variables:, variables:] = np.diag(slack_curvature)
     q = np.concatenate([qp.f, qp.w * slack_unit])
 
     # Two inequalities a row: first those of the lower limits, then those of the upper ones.

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from math import ceil
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import casadi as ca
@@ -88,10 +89,12 @@ class Refinement:
 
 def _lagrange_matrix(nodes: Array, targets: Array) -> Array:
     """Values at the targets (t,) of the Lagrange polynomials of the nodes (q,), shape (t, q)."""
-    matrix = np.ones((len(targets), len(nodes)))
-    for j, k in itertools.permutations(range(len(nodes)), 2):
+    count = len(nodes)
+    matrix = np.ones((len(targets), count))
+    for j, k in itertools.permutations(range(count), 2):
         width = nodes[j] - nodes[k]
-        matrix[:, j] *= (targets - nodes[k]) / width
+        distance = targets - nodes[k]
+        matrix[:, j] *= distance / width
     return matrix
 
 
@@ -232,7 +235,11 @@ class Accuracy:
         substeps = max(self.substeps // 2, 1)
         nodes = [min(count, 5) for count in self.nodes]
         penalty_nodes = [min(count, 10) for count in self.penalty_nodes]
-        return Accuracy(substeps, tuple(nodes), tuple(penalty_nodes))
+        return Accuracy(
+            substeps=substeps,
+            nodes=tuple(nodes),
+            penalty_nodes=tuple(penalty_nodes),
+        )
 
 
 class BellmanOperator:
@@ -282,7 +289,8 @@ class BellmanOperator:
         _, x_next = self._expected_cost(state[None, :], action[None, :])
         x = np.concatenate(x_next)
         mean = x @ self._weights
-        mean_square = (x * x) @ self._weights
+        square = x * x
+        mean_square = square @ self._weights
         # Rounding may leave the variance of a state that does not vary below zero.
         variance = np.maximum(mean_square - mean**2, 0.0)
         return np.asarray(np.sqrt(variance))
@@ -330,7 +338,8 @@ class BellmanOperator:
         from scipy import sparse  # noqa: PLC0415
 
         def rows_of(part: slice) -> tuple[sparse.csr_array, Array]:
-            cost, x_next = self._expected_cost(grid.points[part], actions[part])
+            states = grid.points[part]
+            cost, x_next = self._expected_cost(states, actions[part])
             count, n_nodes = x_next[0].shape
             shape = (count, grid.size)
             rows = np.repeat(np.arange(count), n_nodes)
@@ -338,9 +347,10 @@ class BellmanOperator:
             # the corner's weight. Entries of the same place add up.
             matrix = sparse.csr_array(shape)
             for index, weight in grid.weights(x_next):
-                probabilities = (weight * self._weights).reshape(-1)
-                places = (rows, index.reshape(-1))
-                matrix += sparse.csr_array((probabilities, places), shape=shape)
+                probabilities = weight * self._weights
+                entries = probabilities.reshape(-1)
+                columns = index.reshape(-1)
+                matrix += sparse.csr_array((entries, (rows, columns)), shape=shape)
             return matrix, cost
 
         parts = self._map(rows_of, grid.size)
@@ -362,9 +372,11 @@ class BellmanOperator:
             self._parameters,
         )
         shape = (len(states), len(self._weights))
-        x_next = [np.broadcast_to(entry, shape) for entry in self._step(*arguments)]
+        next_entries = self._step(*arguments)
+        x_next = [np.broadcast_to(entry, shape) for entry in next_entries]
         (stage_cost,) = self._cost(*arguments)
-        cost = _mean(np.broadcast_to(stage_cost, shape), self._weights)
+        at_nodes = np.broadcast_to(stage_cost, shape)
+        cost = _mean(at_nodes, self._weights)
         return cost + self._expected_penalty(x_next), x_next
 
     def _expected_penalty(self, x_next: Sequence[Array]) -> Array:
@@ -375,16 +387,19 @@ class BellmanOperator:
             lowest = x.min(axis=1)
             highest = x.max(axis=1)
             # The outermost Gauss nodes lie inside the law's support.
-            reach = 0.25 * (highest - lowest)
+            spread = highest - lowest
+            reach = 0.25 * spread
             room_below = lowest - reach - problem.state_lower[i]
             room_above = highest + reach - problem.state_upper[i]
             # Only states that may violate a bound are worth the many nodes of the penalty.
             below = np.flatnonzero(room_below < 0)
             above = np.flatnonzero(room_above > 0)
             if len(below):
-                total[below] += self._expected_bound_penalty(x[below], i, -1.0)
+                penalty = self._expected_bound_penalty(x[below], i, -1.0)
+                total[below] += penalty
             if len(above):
-                total[above] += self._expected_bound_penalty(x[above], i, 1.0)
+                penalty = self._expected_bound_penalty(x[above], i, 1.0)
+                total[above] += penalty
         return total
 
     def _expected_bound_penalty(self, x: Array, i: int, sign: float) -> Array:
@@ -394,22 +409,26 @@ class BellmanOperator:
         disturbances, so it is carried to the many nodes that the penalty's kink needs.
         """
         problem = self.problem
-        bound = problem.state_upper[i] if sign > 0 else problem.state_lower[i]
+        bounds = problem.state_upper if sign > 0 else problem.state_lower
         linear = problem.penalty_linear[i]
         quadratic = problem.penalty_quadratic[i]
-        excess = sign * (self._refine(x) - bound)
+        beyond = self._refine(x) - bounds[i]
         # `Penalty` of the scenario, for one bound.
-        violation = np.maximum(excess, 0.0)
-        penalty = (linear + quadratic * violation) * violation
-        return _mean(penalty, self._penalty_weights)
+        violation = np.maximum(sign * beyond, 0.0)
+        price = linear + quadratic * violation
+        return _mean(price * violation, self._penalty_weights)
 
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
         """Results of a task for slices of `count` states, by the threads where there are any."""
         entries = count * len(self._weights)
-        n_tasks = min(-(-entries // ENTRIES_A_TASK), count)  # rounded up
+        wanted = ceil(entries / ENTRIES_A_TASK)
+        n_tasks = min(wanted, count)
         # Parts of nearly equal size, which do not depend on the number of threads.
-        edges = np.linspace(0, count, n_tasks + 1).astype(int)
-        parts = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
+        edges = np.linspace(0, count, n_tasks + 1)
+        whole_edges = edges.astype(int).tolist()
+        parts = []
+        for start, stop in pairwise(whole_edges):
+            parts.append(slice(start, stop))
         if self._pool is None:
             return map(task, parts)
         return self._pool.map(task, parts)

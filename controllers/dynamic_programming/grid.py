@@ -43,13 +43,14 @@ class AxisInterpolant:
 
         weights = np.zeros((stencil_size, stencil_size, n_cells))
         for c in range(n_cells):
+            begin = first[c]
             points = range(c, c + 2)
             if any_cubic and cubic[c]:
-                points = range(first[c], first[c] + CUBIC_POINTS)
+                points = range(begin, begin + CUBIC_POINTS)
             for j in points:
                 polynomial = _lagrange_polynomial(axis, j, points, axis[c])
                 n_powers = len(polynomial)
-                weights[:n_powers, j - first[c], c] = polynomial
+                weights[:n_powers, j - begin, c] = polynomial
 
         self.axis = axis
         self.first = first
@@ -65,6 +66,16 @@ class AxisInterpolant:
         offset = inside - self.axis[cell]
         return cell, offset
 
+    def stencil(self, x: Array) -> list[tuple[Indices, Array]]:
+        """Points of the axis by which values at x are interpolated, and their weights."""
+        cell, offset = self.locate(x)
+        first = self.first[cell]
+        points = []
+        for j in range(self.weights.shape[1]):
+            weight = _horner(self.weights[:, j], cell, [offset])
+            points.append((first + j, weight))
+        return points
+
 
 def _cells_within(axis: Array, interval: tuple[float, float] | None) -> NDArray[np.bool_]:
     """Which cells of an axis lie in an interval, up to rounding; none where it is None."""
@@ -72,8 +83,10 @@ def _cells_within(axis: Array, interval: tuple[float, float] | None) -> NDArray[
         return np.zeros(len(axis) - 1, dtype=bool)
     lower, upper = interval
     tolerance = 1e-9 * (axis[-1] - axis[0])
-    begins_within = axis[:-1] >= lower - tolerance
-    ends_within = axis[1:] <= upper + tolerance
+    begins = axis[:-1]
+    ends = axis[1:]
+    begins_within = begins >= lower - tolerance
+    ends_within = ends <= upper + tolerance
     return np.asarray(begins_within & ends_within)
 
 
@@ -143,12 +156,7 @@ class Grid:
         corners: list[tuple[Indices, Array]] = [(origin, np.ones(()))]
         for interpolant, values in zip(self._interpolants, x, strict=True):
             n_points = len(interpolant.axis)
-            cell, offset = interpolant.locate(values)
-            first = interpolant.first[cell]
-            stencil = []
-            for j in range(interpolant.weights.shape[1]):
-                factor = _horner(interpolant.weights[:, j], cell, [offset])
-                stencil.append((first + j, factor))
+            stencil = interpolant.stencil(values)
             # Each corner so far has one successor for each point of this axis' stencil.
             extended = []
             for index, weight in corners:
@@ -164,10 +172,11 @@ class Grid:
         # Coefficients of the polynomial of each cell: one axis after the other.
         table = values.reshape(self.shape)
         for interpolant in self._interpolants:
-            stencil_size = interpolant.weights.shape[1]
-            stencil = interpolant.first + np.arange(stencil_size)[:, None]
+            weights = interpolant.weights
+            steps = np.arange(weights.shape[1])
+            stencil = interpolant.first + steps[:, None]
             # The first axis becomes (power, cell), and both go last.
-            table = np.einsum("ijc,jc...->...ic", interpolant.weights, table[stencil])
+            table = np.einsum("ijc,jc...->...ic", weights, table[stencil])
 
         # Powers first, as `_horner` reads them; the cells behind them become one axis.
         n = len(self.axes)
@@ -175,7 +184,8 @@ class Grid:
         cells = range(1, 2 * n, 2)
         table = table.transpose(*powers, *cells)
         n_powers = table.shape[:n]
-        table = np.ascontiguousarray(table.reshape(*n_powers, -1))
+        flat = table.reshape(*n_powers, -1)
+        table = np.ascontiguousarray(flat)
 
         def function(x: Sequence[Array]) -> Array:
             index: Indices = np.zeros((), dtype=np.intp)
@@ -191,7 +201,8 @@ class Grid:
 
     @cached_property
     def _interpolants(self) -> list[AxisInterpolant]:
-        smooth = self.smooth or (None,) * len(self.axes)
+        none: tuple[None, ...] = (None,) * len(self.axes)
+        smooth = self.smooth or none
         interpolants = []
         for axis, interval in zip(self.axes, smooth, strict=True):
             interpolants.append(AxisInterpolant(axis, interval))
@@ -253,7 +264,9 @@ def _graded_piece(
     # where it is a whole number, after the last count is rounded up to one.
     increments = np.diff(fine) / width
     count = np.append(0.0, np.cumsum(increments))
-    n_cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
-    whole = np.arange(1, n_cells) * (count[-1] / n_cells)
+    total = count[-1]
+    rounded_up = int(np.ceil(total - 1e-6))
+    n_cells = max(rounded_up, 1)
+    whole = np.arange(1, n_cells) * (total / n_cells)
     inner = np.interp(whole, count, fine)
     return np.append(lower, inner)

@@ -519,9 +519,13 @@ def _scaled_cost(steady: SteadyState, ranges: Array) -> tuple[Array, float]:
     The size is that of the gradient, which is all that a linear cost has, or of the curvature.
     """
     H = steady.hessian * np.outer(ranges, ranges)
-    drift = np.hstack([steady.A - np.eye(len(steady.x)), steady.B])
+    # The gradient by stationarity: the multipliers of the bounds, and those of x₊ = x.
+    identity = np.eye(len(steady.x))
+    drift = np.hstack([steady.A - identity, steady.B])
     gradient = steady.multipliers - drift.T @ steady.costate
-    size = max(np.abs(gradient * ranges).max(), np.abs(H).max())
+    slope = np.abs(gradient * ranges).max()
+    curvature = np.abs(H).max()
+    size = max(slope, curvature)
     return H, float(size) or 1.0
 
 

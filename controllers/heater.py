@@ -14,26 +14,42 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     M, T = ca.vertsplit(x)
     F, Q = ca.vertsplit(u)
     Fin, Tin = ca.vertsplit(d)
-    return ca.vertcat(Fin - F, (Fin * (Tin - T) + 60 * Q / CP) / M)
+    # A kW is 60 kJ a minute.
+    from_feed = Fin * (Tin - T)
+    from_heater = 60 * Q / CP
+    warming = (from_feed + from_heater) / M
+    return ca.vertcat(Fin - F, warming)
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     """Cost of heating and holding, per minute."""
     heat_price, holding_price = ca.vertsplit(p)
-    return heat_price * u[1] + holding_price * x[0]
+    M = x[0]
+    Q = u[1]
+    return heat_price * Q + holding_price * M
 
 
 def model() -> Model:
     """A tank that is heated as its content flows through; time in minutes."""
     return Model(
         name="heater",
-        states=(Quantity("M", "kg", 100.0), Quantity("T", "degC", 60.0)),
-        actions=(Quantity("F", "kg/min", 20.0), Quantity("Q", "kW", 55.7)),
+        states=(
+            Quantity("M", "kg", 100.0),
+            Quantity("T", "degC", 60.0),
+        ),
+        actions=(
+            Quantity("F", "kg/min", 20.0),
+            Quantity("Q", "kW", 55.7),
+        ),
         disturbances=(
             Quantity("Fin", "kg/min", 20.0),
+            # Counted from 0 °C.
             Quantity("Tin", "degC", 20.0, magnitude=20.0),
         ),
-        parameters=(Quantity("heat_price", "1/kW", 1.0), Quantity("holding_price", "1/kg", 0.1)),
+        parameters=(
+            Quantity("heat_price", "1/kW", 1.0),
+            Quantity("holding_price", "1/kg", 0.1),
+        ),
         ode=_ode,
         economic_cost=_economic_cost,
         time_unit=60.0,

@@ -98,7 +98,8 @@ class PiLoops:
         problem = self.problem
         errors = problem.reference_state - s
         error = errors[self.states]
-        u = problem.reference_action + self.gain * (error + self._integral)
+        correction = self.gain * (error + self._integral)
+        u = problem.reference_action + correction
         action: Array = np.clip(u, problem.action_lower, problem.action_upper)
         # At a bound the integral stops where it would push on (conditional integration).
         # The error and what the action lacks have one direction where the integral winds up.
@@ -125,8 +126,9 @@ def pairing(gains: Array) -> NDArray[np.intp]:
     actions, states = linear_sum_assignment(distance)
     chosen = relative[actions, states]
     if not (chosen > 0.0).all():
+        n_states, n_actions = gains.shape
         raise ControllerError(
-            f"{gains.shape[0]} states and {gains.shape[1]} actions make no PI loops: they are one "
+            f"{n_states} states and {n_actions} actions make no PI loops: they are one "
             "state's to each action, and the gains of a sample must allow to pair them"
         )
     return np.asarray(states)

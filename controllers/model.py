@@ -172,6 +172,7 @@ def _column(result: Any) -> Any:
     if isinstance(result, ca.SX | ca.MX | ca.DM):
         return result
     if isinstance(result, np.ndarray):
+        # NumPy users write columns, whose entries may be expressions.
         if result.ndim == 2 and result.shape[1] == 1:
             result = result[:, 0]
         if result.ndim > 1:
@@ -364,6 +365,7 @@ class Model:
         magnitudes = []
         for quantity in self.disturbances:
             magnitude = quantity.magnitude
+            # Zero degrees is a place on a scale, not nothing.
             if magnitude is None and quantity.unit in TEMPERATURES:
                 raise ModelError(
                     f"model '{self.name}': the disturbance {quantity.name} is a temperature in "

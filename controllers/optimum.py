@@ -245,10 +245,11 @@ class OptimalPolicy:
         """
         plant = PlantProblem.from_scenario(scenario)
         if plant.memory is not None:
-            name = plant.problem.model.disturbances[plant.memory.disturbance].name
+            model = plant.problem.model
+            disturbance = model.disturbances[plant.memory.disturbance]
             raise OptimumError(
-                f"the optimal policy needs the value that {name} had in the sample before, which a "
-                "controller is not told; its J is that of `cosim optimum`"
+                f"the optimal policy needs the value that {disturbance.name} had in the sample "
+                "before, which a controller is not told; its J is that of `cosim optimum`"
             )
         key = optimum_key(plant, Settings())
         path = stored_file(key)
@@ -339,7 +340,8 @@ class OptimalPolicy:
             )
         # An action that is not the policy's has no stored value: compute its expectation.
         (expected,) = self._operator.values(state, action, optimum.grid, optimum.W)
-        penalty = problem.penalty(state[0].tolist())
+        (entries,) = state.tolist()
+        penalty = problem.penalty(entries)
         return float(expected) - optimum.gain + penalty
 
     @cached_property

@@ -618,15 +618,18 @@ def _read_answer(qp: SoftQp, answer: qpsolvers.Solution) -> QpSolution:
     """The primal-dual solution of `qp` in that of `qpsolvers_problem(qp)`."""
     variables = qp.f.size
     rows = qp.w.size
-    v = np.asarray(answer.x)[:variables]
+    x = np.asarray(answer.x)
+    box = np.array(answer.z_box)
+    v = x[:variables]
+    nu = box[:variables]
     # A fixed variable is an equation there, and its multiplier that of the equation.
-    nu = np.asarray(answer.z_box)[:variables].copy()
     fixed = qp.lower == qp.upper
     nu[fixed] = np.asarray(answer.y)
     # Two inequalities a row: first those of the lower limits, then those of the upper ones.
     z = np.asarray(answer.z)
-    lam = z[rows:] - z[:rows]
-    return QpSolution(v, nu, lam)
+    below = z[:rows]
+    above = z[rows:]
+    return QpSolution(v, nu, above - below)
 
 
 def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
@@ -651,14 +654,16 @@ def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
     variables = qp.f.size
     rows = qp.w.size
     size = variables + rows
-    slack_unit = qp.H.diagonal().max() / qp.w
+    largest_curvature = qp.H.diagonal().max()
+    slack_unit = largest_curvature / qp.w
 
     # Cost of (v, τ).
+    slack_price = qp.w * slack_unit
     slack_curvature = 2 * qp.W * slack_unit**2
     P = np.zeros((size, size))
     P[:variables, :variables] = qp.H
     P[variables:, variables:] = np.diag(slack_curvature)
-    q = np.concatenate([qp.f, qp.w * slack_unit])
+    q = np.concatenate([qp.f, slack_price])
 
     # Two inequalities a row: first those of the lower limits, then those of the upper ones.
     slack = np.diag(slack_unit)
@@ -667,12 +672,15 @@ def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
 
     # A fixed variable has an equation in the place of its bounds.
     fixed = qp.lower == qp.upper
-    A = np.eye(variables, size)[fixed]
+    v_of_all = np.eye(variables, size)
+    A = v_of_all[fixed]
     b = qp.lower[fixed]
     least_v = np.where(fixed, -np.inf, qp.lower)
     most_v = np.where(fixed, np.inf, qp.upper)
-    lower = np.concatenate([least_v, np.zeros(rows)])
-    upper = np.concatenate([most_v, np.full(rows, np.inf)])
+    least_slack = np.zeros(rows)
+    most_slack = np.full(rows, np.inf)
+    lower = np.concatenate([least_v, least_slack])
+    upper = np.concatenate([most_v, most_slack])
 
     if not dense:
         P = sp.csc_matrix(P)

@@ -13,12 +13,20 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
     V, k0, E, heat, diffusion, UA, coolant, jacket, *_ = ca.vertsplit(p)
+
+    # Arrhenius' law, first order in A; what is hot enough waits for the diffusion of A.
     k = k0 * ca.exp(-E / T)
     rate = k * diffusion / (k + diffusion) * cA
+    fed = q / V * (cAf - cA)
+    heated_by_feed = q / V * (Tf - T)
+    heated_by_reaction = heat * rate
+    heated_by_jacket = UA * (Tj - T)
+    jacket_by_coolant = coolant * (Tc - Tj)
+    jacket_by_reactor = jacket * (T - Tj)
     return ca.vertcat(
-        q / V * (cAf - cA) - rate,
-        q / V * (Tf - T) + heat * rate + UA * (Tj - T),
-        coolant * (Tc - Tj) + jacket * (T - Tj),
+        fed - rate,
+        heated_by_feed + heated_by_reaction + heated_by_jacket,
+        jacket_by_coolant + jacket_by_reactor,
     )
 
 
@@ -27,10 +35,12 @@ def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     cA = x[0]
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
-    feed, pump, cooling, fixed = ca.vertsplit(p[8:])
+    feed_price, pump_price, cooling_price, fixed_cost = ca.vertsplit(p[8:])
+    feed = feed_price * q * cAf
     product = q * (cAf - cA)
-    quadratic = pump * q**2 + cooling * (Tf - Tc) ** 2
-    return fixed + feed * q * cAf - product + quadratic
+    pumping = pump_price * q**2
+    cooling = cooling_price * (Tf - Tc) ** 2
+    return fixed_cost + feed - product + (pumping + cooling)
 
 
 def model() -> Model:
@@ -42,7 +52,10 @@ def model() -> Model:
             Quantity("T", "K", 350.0),
             Quantity("Tj", "K", 315.0),
         ),
-        actions=(Quantity("q", "L/min", 50.0), Quantity("Tc", "K", 290.0)),
+        actions=(
+            Quantity("q", "L/min", 50.0),
+            Quantity("Tc", "K", 290.0),
+        ),
         disturbances=(
             Quantity("cAf", "mol/L", 1.0),
             # Counted from the temperature of the surroundings, 300 K.

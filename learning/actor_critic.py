@@ -78,6 +78,22 @@ class ActionSlopes(NamedTuple):
     cost_hessian: Matrix
 
 
+class ValueSlopes(NamedTuple):
+    """How Q of K samples depends on the action, in the actions' ranges, at the policy's action.
+
+    Attributes:
+        cost: slope of the stage cost, (K, m).
+        value: slope of the expected next value, (K, m).
+        curvature: of both together, (K, m, m).
+        in_state: slope of the expected next value in the next state, (K, n).
+    """
+
+    cost: Matrix
+    value: Matrix
+    curvature: Matrix
+    in_state: Matrix
+
+
 class PolicyGradient(NamedTuple):
     """What a batch of K samples says of the policy.
 
@@ -129,6 +145,7 @@ class ActorCritic(Algorithm):
         self._critic = DifferentialValue(n)
         # Actions are counted in their ranges.
         self._range: Vector = scenario.action_upper - scenario.action_lower
+        # A row a sample.
         self._batch: dict[str, Any] = {
             "s": np.zeros((size, n)),
             "next_s": np.zeros((size, n)),
@@ -203,35 +220,56 @@ class ActorCritic(Algorithm):
             raise DivergenceError("the costs or the predictions are not finite")
         td_errors = self._critic.fit(states, following, errors, reward)
 
-        # Slope and curvature of the expected next value, in the state and then in the action.
-        penalty_slope, penalty_curvature = penalty.slopes(following)
-        mean_error = errors.mean(axis=0)
-        slope = penalty_slope + self._critic.gradient(following + mean_error)
-        curvature = penalty_curvature + self._critic.hessian()
-        gain = at_policy.gain * self._range
-        cost_slope = at_policy.cost_gradient * self._range
-        value_slope = np.einsum("knm,kn->km", gain, slope)
-        cost_curvature = at_policy.cost_hessian * np.outer(self._range, self._range)
-        value_curvature = np.einsum("kni,knl,klj->kij", gain, curvature, gain)
-
         # The chain rule through the policy: ∇J = E[∇π ∇_a Q] (paper.tex, eq. pg_update).
+        mean_error = errors.mean(axis=0)
+        slopes = self._slopes(at_policy, penalty, following, mean_error)
+        action_slope = slopes.cost + slopes.value
         jacobian = batch["jacobian"] * self._step.scale
         jacobian = jacobian / self._range[:, None]
-        action_slope = cost_slope + value_slope
-        action_curvature = cost_curvature + value_curvature
         count = len(states)
         metric = np.einsum("kmi,kmj->ij", jacobian, jacobian) / count
         gradient = np.einsum("kmi,km->i", jacobian, action_slope) / count
-        hessian = np.einsum("kmi,kmn,knj->ij", jacobian, action_curvature, jacobian) / count
+        hessian = np.einsum("kmi,kmn,knj->ij", jacobian, slopes.curvature, jacobian) / count
 
         # What realised costs and next states say of the slope beyond the model.
-        innovation = np.einsum("kn,kn->k", slope, prediction_errors - mean_error)
-        squared_terms = cost_slope**2 + value_slope**2
+        surprise = prediction_errors - mean_error
+        innovation = np.einsum("kn,kn->k", slopes.in_state, surprise)
+        squared_terms = slopes.cost**2 + slopes.value**2
         terms = np.mean(np.sum(squared_terms, axis=1))
         features = np.einsum("kmi,km->ki", jacobian, deviation / self._range)
         weights = self._advantage(features, td_errors + innovation, metric, float(terms))
         gradient = gradient + metric @ weights
         return PolicyGradient(gradient, hessian, metric, td_errors)
+
+    def _slopes(
+        self,
+        at_policy: ActionSlopes,
+        penalty: ExpectedPenalty,
+        following: Matrix,
+        mean_error: Vector,
+    ) -> ValueSlopes:
+        """Slope and curvature of Q in the action, by the chain rule through the next state.
+
+        Args:
+            at_policy: the nominal model at the policy's actions.
+            penalty: its expectation over the prediction errors.
+            following: predictions of the next states, (K, n).
+            mean_error: mean of the prediction errors, (n,).
+        """
+        penalty_slope, penalty_curvature = penalty.slopes(following)
+        # W is quadratic: its mean slope over the errors is that at their mean.
+        in_state = penalty_slope + self._critic.gradient(following + mean_error)
+        curvature = penalty_curvature + self._critic.hessian()
+        gain = at_policy.gain * self._range
+        units = np.outer(self._range, self._range)
+        of_cost = at_policy.cost_hessian * units
+        of_value = np.einsum("kni,knl,klj->kij", gain, curvature, gain)
+        return ValueSlopes(
+            cost=at_policy.cost_gradient * self._range,
+            value=np.einsum("knm,kn->km", gain, in_state),
+            curvature=of_cost + of_value,
+            in_state=in_state,
+        )
 
     def _predict(self, at_policy: Matrix) -> tuple[Matrix, Matrix]:
         """Take in the batch's prediction errors.

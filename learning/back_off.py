@@ -217,6 +217,7 @@ class BackOffSearch:
     def _end_segment(self) -> None:
         self.led_beyond = False
         rows = np.array(self._rows).reshape(-1, self._n_columns)
+        # A bound counts that was active at any of the first round's κ.
         if self._round == 0:
             share = self._n_active / self._length
             self._active = np.maximum(self._active, share)
@@ -327,6 +328,7 @@ class BackOffSearch:
         share = settings.round_shares[phase]
         parts = self._shares * len(offsets)
         wanted = int(self._budget * left * share / parts)
+        # One sample at least counts, once the loop has settled.
         length = max(wanted, self._settling + 1)
 
         least = self._least(bound)
@@ -342,6 +344,7 @@ class BackOffSearch:
     def _least(self, bound: int) -> float:
         """κ of the true bound; at most 0 if the start loosens no bound."""
         state = bound % self._n
+        # Without errors κ has no unit, and there is nothing to look for.
         if self._unit[state] <= 0:
             return 0.0
         if bound < self._n:
@@ -404,6 +407,7 @@ class BackOffSearch:
         last = np.floor(high / settings.resolution)
         grid = settings.resolution * np.arange(first, last + 1)
         best = best_of(grid)
+        # Beyond what was run an estimate is a guess: of these κ the best is chosen.
         falls_at_low_end = best == grid[0] and low > least
         if best == grid[-1] or falls_at_low_end:
             return best_of(np.unique(kappa)), True
@@ -495,6 +499,7 @@ class BackOff(Algorithm):
         """Learn from one sample; the last one of a segment sets the θ of the next."""
         if self._search.has_ended or not self._search.observe(transition):
             return None
+        # The θ of the next segment, or the best one after the last.
         old = self.controller.theta
         new = self._search.trial
         self.controller.theta = new.theta

@@ -32,12 +32,14 @@ _searched: dict[tuple[str, str, float, int], Parameters] = {}
 
 def backed_off(scenario: Scenario) -> RtiNmpc:
     """RTI-NMPC with the cost tuned by economics, backed off for a guessed noise (`back_off`)."""
-    return nmpc(scenario, back_off(tuned(scenario).parameters, scenario))
+    start = tuned(scenario).parameters
+    return nmpc(scenario, back_off(start, scenario))
 
 
 def cautious(scenario: Scenario) -> RtiNmpc:
     """As `backed_off`, with a reserve back-off of each bound that is not active."""
-    start = back_off(tuned(scenario).parameters, scenario)
+    start = tuned(scenario).parameters
+    start = back_off(start, scenario)
     return nmpc(scenario, add_reserve(start, scenario))
 
 
@@ -119,17 +121,22 @@ def add_reserve(
     errors = OneStepModel(scenario).errors(states, actions, next_states, start)
     most = reserve * errors.std(axis=0)
 
+    # Half of what the states have left free.
+    lower = start["x_l"]
+    upper = start["x_u"]
+    room_below = states.min(axis=0) - lower
+    room_above = upper - states.max(axis=0)
+    below = np.clip(room_below / 2, 0.0, most)
+    above = np.clip(room_above / 2, 0.0, most)
+    # A bound that was active has its back-off already: its multiplier is dV/dx_l or dV/dx_u.
     slices = start.blocks.slices
-    below = np.clip((states.min(axis=0) - start["x_l"]) / 2, 0.0, most)
-    above = np.clip((start["x_u"] - states.max(axis=0)) / 2, 0.0, most)
-    lower_active = (gradients[:, slices["x_l"]] != 0).any(axis=0)
-    upper_active = (gradients[:, slices["x_u"]] != 0).any(axis=0)
-    return start.replace(
-        {
-            "x_l": start["x_l"] + np.where(lower_active, 0.0, below),
-            "x_u": start["x_u"] - np.where(upper_active, 0.0, above),
-        }
-    )
+    lower_multipliers = gradients[:, slices["x_l"]]
+    upper_multipliers = gradients[:, slices["x_u"]]
+    lower_active = (lower_multipliers != 0).any(axis=0)
+    upper_active = (upper_multipliers != 0).any(axis=0)
+    below = np.where(lower_active, 0.0, below)
+    above = np.where(upper_active, 0.0, above)
+    return start.replace({"x_l": lower + below, "x_u": upper - above})
 
 
 class GuessedPlant:
@@ -151,11 +158,13 @@ class GuessedPlant:
         model = problem.model
         x, u, d, _ = model.symbols()
         p = ca.SX(ca.DM(model.nominal_parameters))
-        next_x = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
-        results = {"y": next_x, "l": ca.SX(model.economic_cost(x, u, d, p))}
+        simulate = discretise(model, problem.sampling_time, problem.substeps)
+        cost = model.economic_cost(x, u, d, p)
+        arguments = {"x": x, "u": u, "d": d}
+        results = {"y": simulate(x, u, d, p), "l": ca.SX(cost)}
         self.scenario = scenario
         self._deviation = deviation
-        self._function = StackedFunction(define("f", {"x": x, "u": u, "d": d}, results))
+        self._function = StackedFunction(define("f", arguments, results))
         self._nominal = model.nominal_disturbance
         self._magnitudes = model.disturbance_magnitudes
         self._sensors: Sensors | None = None

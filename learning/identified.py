@@ -102,6 +102,7 @@ class Identified(Algorithm):
         next_states = rows[:, -n:]
         p = self._fit(present, states, actions, next_states)
         tuned = self._tuned(present.replace({"p": p}))
+        # The errors that are left are those of the fitted model.
         if not self.configuration.back_off:
             return tuned
         errors = self._model.errors(states, actions, next_states, tuned)

@@ -182,6 +182,7 @@ class PolicySearch(Algorithm):
         self._costs = []
         mean_before = self.theta
         candidate_before = self.controller.theta
+        # CMA-ES learns from whole generations alone.
         if len(self._evaluated) == self.configuration.population:
             self._tell(self._evaluated)
             self._evaluated = []
@@ -207,6 +208,7 @@ class PolicySearch(Algorithm):
 
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned; CMA-ES is told the costs once more."""
+        # Its draws are those of the seed, so the same costs lead to the same distribution.
         self._generations = []
         for costs in state["generations"].tolist():
             self._tell(costs)

@@ -226,18 +226,24 @@ def prior_deviation(
     initial = np.maximum(terminal, arrival)
     root_of_largest_cost = float((stage * move).max())
     slow = settings.slow_state_share * state_deviation
-    bound = settings.back_off_width * width / 0.3 * np.maximum(error_deviation, slow)
+    # At a `prior_width` of 0.3 the bounds have the width that the setting says.
+    relative_width = settings.back_off_width * width / 0.3
+    bound = relative_width * np.maximum(error_deviation, slow)
     # A gradient may shift the minimum by as much as the most expensive typical move costs.
-    shift = terminal * root_of_largest_cost
+    terminal_shift = terminal * root_of_largest_cost
+    stage_shift = stage * root_of_largest_cost
     share = settings.gradient_share
+    initial_gradient = np.maximum(terminal_shift, np.abs(start["b_lambda"]))
+    terminal_gradient = np.maximum(terminal_shift, share * np.abs(start["b_Vf"]))
+    stage_gradient = np.maximum(stage_shift, share * np.abs(start["b_l"]))
     widths: dict[str, ArrayLike] = {
         "B_lambda": width * np.outer(initial, initial),
-        "b_lambda": width * np.maximum(shift, np.abs(start["b_lambda"])),
+        "b_lambda": width * initial_gradient,
         "c_lambda": settings.level_width * abs(level),
         "B_Vf": width * np.outer(terminal, terminal),
-        "b_Vf": width * np.maximum(shift, share * np.abs(start["b_Vf"])),
+        "b_Vf": width * terminal_gradient,
         "B_l": width * np.outer(stage, stage),
-        "b_l": width * np.maximum(stage * root_of_largest_cost, share * np.abs(start["b_l"])),
+        "b_l": width * stage_gradient,
         "c_f": settings.offset_width * error_deviation,
         "x_l": bound,
         "x_u": bound,
@@ -253,7 +259,9 @@ def prior_deviation(
 
 
 def _root_diagonal(matrix: NDArray[np.float64]) -> Vector:
-    root: Vector = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    """Square roots of the diagonal, 0 where it is negative."""
+    diagonal = np.maximum(np.diag(matrix), 0.0)
+    root: Vector = np.sqrt(diagonal)
     return root
 
 
@@ -264,15 +272,18 @@ class ValueRule(Algorithm):
         super().__init__(*arguments)
         self._model = OneStepModel(self.scenario)
         self._errors = PredictionErrors(self.scenario, self.configuration.prediction_errors)
+        # The mean cost must be slower than the plant, or it follows each transient.
         memory, gradient_memory = self.configuration.mean_cost_samples(self._model.slowest)
+        blocks = self.controller.parameters.blocks
         self._average_cost = AverageCost(
             discount=self.configuration.td_discount(self.scenario),
-            position=self.controller.parameters.blocks.slices["c_lambda"].start,
+            position=blocks.slices["c_lambda"].start,
             scale=1.0,
             start=self.scenario.controller.reference_cost,
             memory=memory,
             gradient_memory=gradient_memory,
         )
+        # θ's own units, until the first samples have given the widths.
         self._set_coordinates(np.ones(self.controller.theta.size))
 
     def _set_coordinates(self, scale: Vector) -> None:
@@ -294,14 +305,16 @@ class ValueRule(Algorithm):
             noise: standard deviation of the TD errors, which c_lambda's level is not below.
         """
         start = self.controller.parameters
+        # The mean error is measured, so it need not be learned from costs.
         if self.configuration.measure_offset:
             start = start.replace({"c_f": errors.mean(axis=0)})
+        level = abs(float(start["c_lambda"]))
         deviation = prior_deviation(
             start,
             state_deviation=states.std(axis=0),
             error_deviation=errors.std(axis=0),
             action_deviation=self.strategy.deviation,
-            level=max(abs(float(start["c_lambda"])), noise),
+            level=max(level, noise),
             settings=self.configuration,
         )
         self._set_coordinates(deviation)
@@ -398,14 +411,19 @@ class QLearning(ValueRule):
         rows = np.array(self._warm_up)
         self._warm_up.clear()
         n = self._model.n_states
+        states = rows[:, :n]
+        errors = rows[:, n:-1]
+        levels = rows[:, -1]
         # The start's TD errors are the noise that the filter expects.
-        td_errors = self._average_cost.begin(rows[:, -1])
+        td_errors = self._average_cost.begin(levels)
         variance = float(np.mean(td_errors**2))
         if not np.isfinite(variance):
             raise DivergenceError("TD errors are not finite")
-        start = self._begin_with_prior(rows[:, :n], rows[:, n:-1], variance**0.5)
-        self._regression = self._new_regression(max(variance, np.finfo(np.float64).tiny))
-        return self._step.move(start.theta, variance**0.5)
+        deviation = variance**0.5
+        start = self._begin_with_prior(states, errors, deviation)
+        least_variance = np.finfo(np.float64).tiny
+        self._regression = self._new_regression(max(variance, least_variance))
+        return self._step.move(start.theta, deviation)
 
     def _new_regression(self, variance: float) -> KalmanRegression:
         settings = self.configuration
@@ -428,7 +446,9 @@ class QLearning(ValueRule):
         gradient = solution.value_gradient * self._step.scale
         rule = td_fit if settings.rule == "fit" else td_step
         fit = rule(td_error, gradient, settings.step_size)
-        return self._step.apply(self._average_cost.absorb(fit), abs(td_error))
+        # At a discount of 1 the fit's part of the level goes to the mean cost.
+        fit = self._average_cost.absorb(fit)
+        return self._step.apply(fit, abs(td_error))
 
     def begin_anew(self) -> None:
         """Forget noise and widths; the next samples are a warm-up at the present θ."""
@@ -507,14 +527,17 @@ class KalmanRegression:
         innovation = td_error - float(gradient @ self.mean)
         # A rare spike of the cost must not move θ as far as a hundred samples do.
         limit = self.clip * self.variance**0.5
+        clipped = min(max(innovation, -limit), limit)
         gain = spread / scale
-        self.mean += gain * min(max(innovation, -limit), limit)
+        self.mean += gain * clipped
         self.covariance -= gain[:, None] * spread
+        # A plant that drifts makes what was learned less certain.
         if self.drift:
             diagonal = np.diag_indices_from(self.covariance)
             self.covariance[diagonal] += self.drift
         # The variance follows slowly, and an outlier counts as a bounded one.
-        square = min(innovation * innovation, self.outlier * self.variance)
+        largest_square = self.outlier * self.variance
+        square = min(innovation * innovation, largest_square)
         self.variance += (square - self.variance) / self.memory
         return innovation
 
@@ -533,6 +556,7 @@ class KalmanRegression:
         # Rounding makes P asymmetric over thousands of updates.
         symmetric = (self.covariance + self.covariance.T) / 2
         information: Matrix = np.linalg.inv(symmetric).astype(np.float64)
+        # From the new θ on, d is counted from zero.
         step = self.mean
         self.mean = np.zeros_like(step)
         return Fit(information @ step, step, lambda: information)
@@ -643,9 +667,11 @@ class AverageCost:
         """
         if self.discount != 1.0:
             return td_errors, gradients
+        # The mean of ∇Q would pay the level into θ.
         level = float(td_errors.mean())
+        mean_gradient = gradients.mean(axis=0)
         self.mean_cost += level
-        return td_errors - level, gradients - gradients.mean(axis=0)
+        return td_errors - level, gradients - mean_gradient
 
     def target(self, cost: Values, next_value: Values) -> Values:
         """Target of Q(s, a), of one sample or of several.
@@ -666,9 +692,11 @@ class AverageCost:
             return fit
         # c_lambda stays, since it cancels out of δ at γ = 1.
         minimiser = fit.minimiser.copy()
-        self.mean_cost += float(minimiser[self._position]) * self._scale
+        level = float(minimiser[self._position])
+        self.mean_cost += level * self._scale
         minimiser[self._position] = 0.0
-        return replace(fit, gradient=fit.metric() @ minimiser, minimiser=minimiser)
+        gradient = fit.metric() @ minimiser
+        return replace(fit, gradient=gradient, minimiser=minimiser)
 
     def state_dict(self) -> State:
         """g, the scale of its entry, and the mean of ∇Q."""

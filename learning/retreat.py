@@ -159,9 +159,11 @@ class Retreat:
     def _shown(self) -> ShownCost:
         """The cost of what batches the samples fill, which are forgotten."""
         n_batches = len(self._costs) // self._batch
-        costs = np.array(self._costs[: n_batches * self._batch])
+        n_samples = n_batches * self._batch
+        costs = np.array(self._costs[:n_samples])
         self._costs = []
-        return ShownCost(self._theta, costs.reshape(n_batches, self._batch).mean(axis=1))
+        batches = costs.reshape(n_batches, self._batch)
+        return ShownCost(self._theta, batches.mean(axis=1))
 
     def _end_of_start(self) -> None:
         shown = self._shown()
@@ -173,7 +175,8 @@ class Retreat:
         """A cost of the best θ, together with what was known of it."""
         if self._best is None:
             return shown
-        return ShownCost(shown.theta, np.concatenate([self._best.batches, shown.batches]))
+        batches = np.concatenate([self._best.batches, shown.batches])
+        return ShownCost(shown.theta, batches)
 
     def _end_of_shift(self, shown: ShownCost, predicted: float) -> Vector | None:
         """Compare the shift's cost with the best one; θ to go back to, if any."""

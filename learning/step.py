@@ -44,7 +44,9 @@ class Fit:
 
     def shrunk(self, factor: float) -> Fit:
         """The fit whose minimiser is `factor` times this one's, with the same metric."""
-        return replace(self, gradient=factor * self.gradient, minimiser=factor * self.minimiser)
+        gradient = factor * self.gradient
+        minimiser = factor * self.minimiser
+        return replace(self, gradient=gradient, minimiser=minimiser)
 
     def within(self, radius: float, size: Callable[[Vector], float]) -> Fit:
         """The fit with this one's minimiser, shortened into a trust region, and the same metric.
@@ -314,12 +316,15 @@ class ConstrainedStep:
         new = theta.copy() if admissible is None else admissible.copy()
         # Least slack weights: exact (linear) and convex (quadratic).
         for name, minimum in self._minima.items():
-            new[slices[name]] = np.maximum(new[slices[name]], minimum)
+            weights = new[slices[name]]
+            np.maximum(weights, minimum, out=weights)
+        # What was corrected may be longer than the fit's step.
+        change = new - theta
         reach = 0.0
         if fit.reach is not None:
-            reach = fit.reach((new - theta) / self.scale)
+            reach = fit.reach(change / self.scale)
         if reach > 1.0:
-            new = theta + (new - theta) / reach
+            new = theta + change / reach
         # Crossed bounds leave no feasible state, and no solver can mend them.
         crossed = not (new[slices["x_l"]] < new[slices["x_u"]]).all()
         refused = admissible is None or crossed
@@ -343,8 +348,11 @@ class ConstrainedStep:
         Returns:
             What the log says of the step.
         """
-        step = (theta - self._controller.theta) / self.scale
-        return self.apply(Fit(step, step, lambda: np.eye(step.size)), td_error)
+        change = theta - self._controller.theta
+        step = change / self.scale
+        # In the metric I the minimiser is the step itself.
+        fit = Fit(step, step, lambda: np.eye(step.size))
+        return self.apply(fit, td_error)
 
     def state_dict(self) -> State:
         """The coordinates and the least eigenvalue."""

@@ -213,7 +213,8 @@ class Training(Result):
 
     def theta(self) -> dict[str, Array]:
         """Increments of θ since the start by block, (K, entries) each."""
-        moved = np.array([row.parameters.theta - self.start.theta for row in self.rows])
+        thetas = np.array([row.parameters.theta for row in self.rows])
+        moved = thetas - self.start.theta
         slices = self.parameters.blocks.slices
         return {name: moved[:, where] for name, where in slices.items()}
 
@@ -552,14 +553,17 @@ class _Session:
 
     def first_row(self, evaluator: Evaluator) -> LogRow:
         """The line of the log before the first sample: the start, evaluated."""
+        start = self.start
         metrics = dict.fromkeys(LOG_COLUMNS, float("nan"))
+        # Nothing has happened yet: all that is counted is zero.
         counts = dict.fromkeys(asdict(self.loop.counts), 0)
         counts.pop("number")
-        metrics |= {"samples": 0, "plant_samples": 0, **counts}
-        metrics |= dict.fromkeys(("updates", "corrected", "refused", "retreats"), 0)
-        metrics["smallest_eigenvalue"] = smallest_eigenvalue(self.start.blocks, self.start.theta)
+        metrics |= counts
+        for name in ("samples", "plant_samples", "updates", "corrected", "refused", "retreats"):
+            metrics[name] = 0
+        metrics["smallest_eigenvalue"] = smallest_eigenvalue(start.blocks, start.theta)
         metrics |= _greedy(evaluator.start)
-        return LogRow(metrics, self.start)
+        return LogRow(metrics, start)
 
     def row(self, number: int, evaluator: Evaluator | None) -> LogRow:
         """A line of the log since the last one, with an evaluation where there is an evaluator."""
@@ -568,7 +572,9 @@ class _Session:
         # Of no update there is no mean.
         n_updates = len(updates) or float("nan")
         n_costs = len(self.costs) or float("nan")
+        mean_cost = _total(self.costs) / n_costs
         mean_square = _total(update.td_error**2 for update in updates) / n_updates
+        mean_step = _total(update.step for update in updates) / n_updates
         # Of all θ since the last row, whichever step gave it.
         smallest = smallest_eigenvalue(parameters.blocks, parameters.theta)
         for update in updates:
@@ -577,9 +583,9 @@ class _Session:
         metrics = dict.fromkeys(LOG_COLUMNS, float("nan"))
         metrics["samples"] = number
         metrics["updates"] = len(updates)
-        metrics["J"] = _total(self.costs) / n_costs
+        metrics["J"] = mean_cost
         metrics["td_error"] = mean_square**0.5
-        metrics["step"] = _total(update.step for update in updates) / n_updates
+        metrics["step"] = mean_step
         metrics["smallest_eigenvalue"] = smallest
         metrics["corrected"] = sum(update.corrected for update in updates)
         metrics["refused"] = sum(update.refused for update in updates)
@@ -589,7 +595,8 @@ class _Session:
         self.costs = []
         self.updates = []
         if evaluator is not None:
-            metrics |= _greedy(evaluator.evaluate(parameters.theta))
+            evaluation = evaluator.evaluate(parameters.theta)
+            metrics |= _greedy(evaluation)
         return LogRow(metrics, parameters)
 
     def divergence(self, row: LogRow, evaluator: Evaluator) -> str | None:
@@ -628,10 +635,12 @@ class _Session:
             self.without_checkpoint = str(error)
             return
         # All that the rest of the run depends on, the log included.
+        metrics = [list(row.values()) for row in self.rows]
+        thetas = [row.parameters.theta for row in self.rows]
         state = prefixed("loop", self.loop.state_dict())
         state["plant"] = np.frombuffer(plant, np.uint8)
-        state["rows"] = np.array([list(row.values()) for row in self.rows], float)
-        state["row_thetas"] = np.array([row.parameters.theta for row in self.rows])
+        state["rows"] = np.array(metrics, float)
+        state["row_thetas"] = np.array(thetas)
         checkpoint.save(path, self.identity, state)
 
     def load(self) -> None:
@@ -654,8 +663,11 @@ class _Session:
         self.rows = []
         for values, theta in zip(state["rows"].tolist(), state["row_thetas"], strict=True):
             metrics = dict(zip(LOG_COLUMNS, values, strict=True))
-            self.rows.append(LogRow(metrics, self.start.with_theta(theta)))
-        self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
+            parameters = self.start.with_theta(theta)
+            self.rows.append(LogRow(metrics, parameters))
+        snapshot = self.plant.deserialise(state["plant"].tobytes())
+        self.plant.restore(snapshot)
+        # The loop last: it reads the plant's state.
         self.loop.load_state_dict(part_of(state, "loop"))
 
 
@@ -663,8 +675,8 @@ def _greedy(evaluation: Mapping[str, Any]) -> dict[str, float]:
     """Columns of the log that an evaluation fills, NaN where it knows nothing."""
     columns = {f"greedy_{name}": evaluation[name] for name in METRICS}
     for name in ("regret", "gap_closed"):
-        known = evaluation[name] is not None
-        columns[name] = evaluation[name] if known else float("nan")
+        value = evaluation[name]
+        columns[name] = float("nan") if value is None else value
     return columns
 
 

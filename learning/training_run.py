@@ -276,7 +276,12 @@ def begin_training(
     third_child = np.random.SeedSequence(run.seed).spawn(3)[2]
     algorithm_rng = np.random.default_rng(third_child)
     rule = algorithm(
-        controller, run.scenario, run.configuration, run.samples, strategy, algorithm_rng
+        controller,
+        run.scenario,
+        run.configuration,
+        run.samples,
+        strategy,
+        algorithm_rng,
     )
     loop = TrainingLoop(
         plant,
@@ -288,6 +293,7 @@ def begin_training(
         algorithm_rng,
         _retreat(run, rule, controller.theta),
     )
+    # A rule on a simulator says where its first episode begins.
     first_episode = getattr(rule, "first_episode", None)
     if first_episode is None:
         loop.start(plant.reset(plant_seed), plant.y)

@@ -55,13 +55,15 @@ def nelder_mead(
         rows = np.flatnonzero(spread > precision)
         if not len(rows):
             break
-        best = values[rows, 0]
-        second_worst = values[rows, -2]
-        worst = values[rows, -1]
+        present = values[rows]
+        best = present[:, 0]
+        second_worst = present[:, -2]
+        worst = present[:, -1]
 
         # Reflect the worst vertex at the centre of the others.
         worst_vertex = vertices[rows, -1]
-        centre = vertices[rows, :-1].mean(axis=1)
+        others = vertices[rows, :-1]
+        centre = others.mean(axis=1)
         candidate = np.clip(2.0 * centre - worst_vertex, lower, upper)
         reflected = objective(rows, candidate)
         is_best = reflected < best
@@ -69,19 +71,22 @@ def nelder_mead(
 
         # Expansion, outside contraction and inside contraction as multiples of centre − worst.
         contraction = np.where(reflected < worst, 0.5, -0.5)
-        factor = np.where(is_best, 2.0, contraction)[:, None]
-        trial = np.clip(centre + factor * (centre - worst_vertex), lower, upper)
+        factor = np.where(is_best, 2.0, contraction)
+        direction = centre - worst_vertex
+        trial = centre + factor[:, None] * direction
+        trial = np.clip(trial, lower, upper)
         tried = np.flatnonzero(is_best | ~is_accepted)
         outcome = np.full(len(rows), np.inf)
         if len(tried):
             outcome[tried] = objective(rows[tried], trial[tried])
-        trial_is_better = (outcome < reflected)[:, None]
-        candidate = np.where(trial_is_better, trial, candidate)
+        trial_is_better = outcome < reflected
+        candidate[trial_is_better] = trial[trial_is_better]
         outcome = np.minimum(outcome, reflected)
 
         improved = outcome < worst
-        vertices[rows[improved], -1] = candidate[improved]
-        values[rows[improved], -1] = outcome[improved]
+        improved_rows = rows[improved]
+        vertices[improved_rows, -1] = candidate[improved]
+        values[improved_rows, -1] = outcome[improved]
         # What no point improved shrinks towards its best vertex.
         shrinking = rows[~improved]
         if not len(shrinking):
@@ -92,7 +97,9 @@ def nelder_mead(
             values[shrinking, i] = objective(shrinking, halfway)
 
     best_vertex = values.argmin(axis=1)
-    return vertices[every_row, best_vertex], values[every_row, best_vertex]
+    minimisers = vertices[every_row, best_vertex]
+    least_values = values[every_row, best_vertex]
+    return minimisers, least_values
 
 
 def _first_simplices(

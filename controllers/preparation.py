@@ -1021,9 +1021,9 @@ class Spectrum:
         lifted = np.maximum(values, self.floor)
         derivative = (values > self.floor).astype(float)
 
-        a, b = _pairs(values)
-        lifted_a, lifted_b = _pairs(lifted)
-        derivative_a, derivative_b = _pairs(derivative)
+        a, b = _all_pairs(values)
+        lifted_a, lifted_b = _all_pairs(lifted)
+        derivative_a, derivative_b = _all_pairs(derivative)
         gap = a - b
         rise = lifted_a - lifted_b
         largest = np.abs(values).max()
@@ -1033,7 +1033,7 @@ class Spectrum:
         return np.where(same, derivative_a * derivative_b, rise / divisor)
 
 
-def _pairs(values: Vector) -> tuple[Vector, Vector]:
+def _all_pairs(values: Vector) -> tuple[Vector, Vector]:
     """First (N, s, 1) and second (N, 1, s) members of all pairs of entries in rows (N, s)."""
     first = values[:, :, None]
     second = values[:, None, :]

@@ -485,7 +485,8 @@ class EmpiricalModel:
         steps = [thinning] * (settings.fit_rounds - 1)
         for step in [*steps, 1]:
             # Residuals from before a change help to size the noise of a young regime.
-            noise = _noise(np.concatenate([residuals, earlier_residuals]), least_variance)
+            known = np.concatenate([residuals, earlier_residuals])
+            noise = _residual_covariance(known, least_variance)
             # In closed loop no slope can be told from what persists: states and actions follow.
             widths = priors[-1:] if persistence.any() else priors
             # Linearised at the present c: a Gauss-Newton step.
@@ -632,7 +633,7 @@ def design_rows(G: Array, standardised: Array) -> Array:
     return design
 
 
-def _noise(residuals: Array, least_variance: Array) -> Array:
+def _residual_covariance(residuals: Array, least_variance: Array) -> Array:
     """Covariance of residuals (M, K), (K, K), each variance at least its least, (K,)."""
     noise: Array = residuals.T @ residuals / len(residuals)
     variance = np.diag(noise)

@@ -108,9 +108,9 @@ class Evaluator:
             **means,
             "difference": difference.value,
             "difference_interval": difference.interval,
-            "regret": _if_known(excess.value),
+            "regret": number_if_known(excess.value),
             "regret_interval": excess.interval,
-            "gap_closed": _if_known(gap.value),
+            "gap_closed": number_if_known(gap.value),
         }
 
     def _costs(self, policy: Controller) -> dict[str, Array]:
@@ -123,8 +123,8 @@ class Evaluator:
         return indicators_of(self._plant, policy, seeds, run.evaluation_steps)
 
 
-def _if_known(value: float) -> float | None:
-    """The value; None where it is NaN or infinite."""
+def number_if_known(value: float) -> float | None:
+    """The number for a JSON document; None where it is NaN or infinite, so not known."""
     return value if isfinite(value) else None
 
 

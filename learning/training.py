@@ -43,7 +43,7 @@ from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
-from learning.evaluator import Evaluator
+from learning.evaluator import Evaluator, number_if_known
 from learning.log import LOG_COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
 from learning.training_run import TrainingRun, begin_training, make_run
@@ -309,8 +309,8 @@ class Training(Result):
             "hyperparameters": run.configuration.model_dump(mode="json"),
             "verdict": self.verdict,
             "updates": self.updates,
-            "predicted_cost": _known(self.predicted_cost),
-            "realised_cost": _known(self.realised_cost),
+            "predicted_cost": number_if_known(self.predicted_cost),
+            "realised_cost": number_if_known(self.realised_cost),
             "changes": self.changes,
             "retreats": self.retreats,
             "parameters_hash": self.parameters.hash,
@@ -678,11 +678,6 @@ def _greedy(evaluation: Mapping[str, Any]) -> dict[str, float]:
         value = evaluation[name]
         columns[name] = float("nan") if value is None else value
     return columns
-
-
-def _known(value: float) -> float | None:
-    """A number for a JSON document, None where it is not known."""
-    return value if isfinite(value) else None
 
 
 def _total(values: Iterable[float]) -> float:

@@ -6,6 +6,13 @@ does, and stay off. The disturbances d are taken as white noise about their nomi
 uncertain parameters as random walks, each sensor's noise as white. A reading that arrives late is
 one of an earlier state: the filter keeps as many earlier states as the latest sensor needs.
 
+The variances of these noises may be part of θ, as a block `noise` of their logarithms. A solution's
+derivatives are then the total ones, through the estimate:
+
+    dV/dθ = ∂V/∂θ + dV/dx̂ · dx̂/dθ,    dπ/dθ = ∂π/∂θ + dπ/dx̂ · dx̂/dθ
+
+at the point where the QP was linearised (`controllers.estimator_sensitivities` has dx̂/dθ).
+
 Source: Anderson and Moore, Optimal Filtering, 1979, ch. 8.2 (extended filter), ch. 7.3 (the state
 augmented by delayed ones).
 """
@@ -13,16 +20,22 @@ augmented by delayed ones).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from math import log, pi
 from typing import Any, Protocol, Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controllers.errors import ControllerError, ModelError
+from controllers.errors import ControllerError, ModelError, ParameterError
+from controllers.estimator_sensitivities import FilterSensitivities
 from controllers.functions import StackedFunction, define
 from controllers.model import discretise
 from controllers.problem import Problem
+from controllers.rti import RtiSolution
+from controllers.theta import Parameters, ThetaBlocks, noise_block
 from cosim.core.modules import load_plugin
 from cosim.core.protocols import Controller, Matrix, Solution, Vector
 from cosim.core.scenario import EstimatorTable, Scenario, SensorTable
@@ -83,6 +96,13 @@ class ExtendedKalmanFilter:
         sensor_deviation: Expected deviations of the sensors, (n_y,); without them their own.
         parameter_drift: Expected deviation of an uncertain parameter's change in a day, as a share
             of its nominal value; 0 takes the model's parameters as they are.
+        differentiates: Whether to propagate derivatives by `noise`.
+
+    Attributes:
+        noise_labels: What the entries of `noise` are of: each disturbance, the change of each
+            uncertain parameter in a sample, each sensor, (q,).
+        log_likelihood: Of all readings since the last `reset`, by their innovations.
+        sensitivities: The derivatives; None where it does not differentiate.
 
     Raises:
         ModelError: A sensor reads what is neither a state nor an output of the model, or a
@@ -98,6 +118,7 @@ class ExtendedKalmanFilter:
         disturbance_deviation: ArrayLike | None = None,
         sensor_deviation: ArrayLike | None = None,
         parameter_drift: float = 0.1,
+        differentiates: bool = False,
     ) -> None:
         self._problem = problem
         self._sensors = tuple(sensors)
@@ -112,8 +133,7 @@ class ExtendedKalmanFilter:
         self._reference = np.concatenate([problem.reference_state, nominal])
         self._n = self._reference.size
         share = parameter_drift * np.sqrt(problem.sampling_time / DAY)
-        drifts = np.concatenate([np.zeros(problem.n_states), share * np.abs(nominal)])
-        self._drift_variance = np.diag(drifts**2)
+        self._drift_variance = (share * np.abs(nominal)) ** 2
         self._initial_deviation = np.concatenate(
             [INITIAL_DEVIATION * _widths(problem), UNCERTAIN * np.abs(nominal)]
         )
@@ -127,15 +147,26 @@ class ExtendedKalmanFilter:
         else:
             deviations = _of_size("sensor_deviation", sensor_deviation, self._sensors)
         self._sensor_variance = np.maximum(deviations, EXACT * self._sizes_of_outputs()) ** 2
+        self.noise_labels = (
+            *(f"disturbance {quantity.name}" for quantity in model.disturbances),
+            *(f"parameter {model.parameters[i].name}" for i in self._uncertain),
+            *(f"sensor {sensor.variable}" for sensor in sensors),
+        )
+        self.sensitivities: FilterSensitivities | None = None
+        if differentiates:
+            self.sensitivities = FilterSensitivities(
+                self._transition, self._output, self._longest + 1, len(self._uncertain)
+            )
         self._check_observability()
         self.reset()
 
     @classmethod
-    def from_scenario(cls, scenario: Scenario) -> Self:
+    def from_scenario(cls, scenario: Scenario, *, differentiates: bool = False) -> Self:
         """The filter of a scenario with sensors.
 
         Args:
             scenario: Has the tables `[[sensor]]` and `[estimator]`.
+            differentiates: Whether to propagate derivatives by `noise`.
         """
         table = scenario.estimator or EstimatorTable()
         return cls(
@@ -144,6 +175,7 @@ class ExtendedKalmanFilter:
             disturbance_deviation=table.disturbance_deviation,
             sensor_deviation=table.sensor_deviation,
             parameter_drift=table.parameter_drift,
+            differentiates=differentiates,
         )
 
     def reset(self) -> None:
@@ -153,6 +185,36 @@ class ExtendedKalmanFilter:
         self._states = np.tile(self._reference, (self._longest + 1, 1))
         self._covariance = np.zeros((self._states.size, self._states.size))
         self._covariance[:n, :n] = np.diag(self._initial_deviation**2)
+        self.log_likelihood = 0.0
+        if self.sensitivities is not None:
+            self.sensitivities.reset()
+
+    @property
+    def noise(self) -> Vector:
+        """Logarithms of the variances that `noise_labels` names, (q,), in the variables' units."""
+        variances = [self._disturbance_variance, self._drift_variance, self._sensor_variance]
+        logarithms: Vector = np.log(np.concatenate(variances))
+        return logarithms
+
+    @noise.setter
+    def noise(self, noise: ArrayLike) -> None:
+        variances = np.exp(_of_size("noise", noise, self.noise_labels))
+        first_sensor = variances.size - self._delays.size
+        first_drift = first_sensor - len(self._uncertain)
+        self._disturbance_variance = variances[:first_drift]
+        self._drift_variance = variances[first_drift:first_sensor]
+        self._sensor_variance = variances[first_sensor:]
+
+    def add_noise(self, parameters: Parameters) -> Parameters:
+        """θ with this filter's `noise` as a block, its last; θ itself where it has one.
+
+        Args:
+            parameters: θ.
+        """
+        if "noise" in parameters.blocks:
+            return parameters
+        blocks = ThetaBlocks((*parameters.blocks, noise_block(self.noise_labels)))
+        return Parameters(blocks, np.concatenate([parameters.theta, self.noise]))
 
     @property
     def estimate(self) -> Vector:
@@ -174,12 +236,17 @@ class ExtendedKalmanFilter:
 
     def state_dict(self) -> dict[str, Vector]:
         """All that the filter remembers."""
-        return {"states": self._states.copy(), "covariance": self._covariance.copy()}
+        state = {"states": self._states.copy(), "covariance": self._covariance.copy()}
+        if self.sensitivities is not None:
+            state |= self.sensitivities.state_dict()
+        return state
 
     def load_state_dict(self, state: Mapping[str, Vector]) -> None:
         """Restore what `state_dict` returned."""
         self._states = state["states"].copy()
         self._covariance = state["covariance"].copy()
+        if self.sensitivities is not None:
+            self.sensitivities.load_state_dict(state)
 
     def predict(self, a: ArrayLike) -> None:
         """Go on by a sample.
@@ -194,11 +261,18 @@ class ExtendedKalmanFilter:
         step()
         A = step.matrix("A").T
         G = step.matrix("G").T
+        if self.sensitivities is not None:
+            self.sensitivities.predict(
+                self._covariance, self._disturbance_variance, self._drift_variance
+            )
         # Every state moves back by one sample, the oldest is forgotten.
         kept = self._covariance[: self._covariance.shape[0] - n, : self._covariance.shape[0] - n]
         across = A @ self._covariance[:n]
         moved = np.empty_like(self._covariance)
-        noise = (G * self._disturbance_variance) @ G.T + self._drift_variance
+        noise = (G * self._disturbance_variance) @ G.T
+        # What drifts are the last entries of z.
+        drifting = range(n - len(self._uncertain), n)
+        noise[drifting, drifting] += self._drift_variance
         moved[:n, :n] = across[:, :n] @ A.T + noise
         if self._longest:
             moved[n:, n:] = kept
@@ -245,6 +319,17 @@ class ExtendedKalmanFilter:
         variance = slope @ across[first : first + n] + self._sensor_variance[i]
         gain = across / variance
         innovation = reading - output.part("y")[i]
+        self.log_likelihood -= (innovation**2 / variance + log(2 * pi * variance)) / 2
+        if self.sensitivities is not None:
+            self.sensitivities.correct(
+                i,
+                delay,
+                self._covariance,
+                across,
+                variance,
+                innovation,
+                self._sensor_variance[i],
+            )
         self._states += (gain * innovation).reshape(self._states.shape)
         # Symmetric by its form; the sensor's variance keeps it positive semidefinite.
         self._covariance -= np.outer(gain, across)
@@ -292,15 +377,48 @@ class ExtendedKalmanFilter:
             )
 
 
+@dataclass(eq=False)
+class EstimatedSolution(RtiSolution):
+    """A solution at an estimate: its derivatives by θ include those through the estimate.
+
+    Attributes:
+        place: Of the block `noise` in θ.
+        by_noise: dx̂/dη, (q, n).
+    """
+
+    place: slice = field(kw_only=True, repr=False)
+    by_noise: Matrix = field(kw_only=True, repr=False)
+
+    @cached_property
+    def value_gradient(self) -> Vector:
+        """dV/dθ or dQ/dθ, shape (n_θ,), by `noise` dV/dx̂ · dx̂/dη."""
+        gradient = super().value_gradient.copy()
+        gradient[self.place] = self.by_noise @ self.costates[0]
+        return gradient
+
+    @property
+    def policy_jacobian(self) -> Matrix:
+        """dπ/dθ, shape (m, n_θ), by `noise` dπ/dx̂ · dx̂/dη; as for an exact state otherwise."""
+        jacobian = super().policy_jacobian.copy()
+        jacobian[:, self.place] = self.policy_state_jacobian @ self.by_noise.T
+        return jacobian
+
+
 class OutputFeedback:
     """A controller that is given measurements: an estimator, then a controller of the state.
 
     `prepare` predicts the state under the action that was applied, and lets the controller prepare;
     `feedback(y)` corrects the estimate, and feeds it back. Any other attribute is the controller's.
+    Where θ has a block `noise` the estimator's variances are θ's, and the solutions' derivatives
+    include those through the estimate. After θ has moved they are those of the trajectory as it
+    was, with the past at the θ that it had.
 
     Args:
         estimator: Estimates the state.
         controller: Takes the estimate for the state.
+
+    Raises:
+        ParameterError: The block `noise` of θ is of another estimator.
     """
 
     given = "measurement"
@@ -308,6 +426,12 @@ class OutputFeedback:
     def __init__(self, estimator: Estimator, controller: Controller) -> None:
         self.estimator = estimator
         self.controller = controller
+        self._noise_place: slice | None = None
+        parameters = getattr(controller, "parameters", None)
+        if isinstance(parameters, Parameters) and "noise" in parameters.blocks:
+            _require_noise_of(estimator, parameters.blocks.block("noise").labels)
+            self._noise_place = parameters.blocks.slices["noise"]
+            self._set_noise()
         self._last_action: Vector | None = None
         self._is_predicted = True
         self._is_corrected = False
@@ -325,7 +449,10 @@ class OutputFeedback:
         """
         kind = (scenario.estimator or EstimatorTable()).kind
         if kind == "ekf":
-            return cls(ExtendedKalmanFilter.from_scenario(scenario), controller)
+            parameters = getattr(controller, "parameters", None)
+            differentiates = isinstance(parameters, Parameters) and "noise" in parameters.blocks
+            estimator = ExtendedKalmanFilter.from_scenario(scenario, differentiates=differentiates)
+            return cls(estimator, controller)
         if kind == "none":
             raise ControllerError("estimator.kind is 'none': there is no estimator to put before")
         factory = load_plugin(kind, "estimator.kind", ControllerError)
@@ -381,6 +508,7 @@ class OutputFeedback:
 
     def prepare(self) -> None:
         """Predict the state, and do the controller's work that needs no measurement."""
+        self._set_noise()
         if not self._is_predicted and self._last_action is not None:
             self.estimator.predict(self._last_action)
         self._is_predicted = True
@@ -399,8 +527,23 @@ class OutputFeedback:
             self.estimator.correct(np.asarray(y, dtype=np.float64))
             self._is_corrected = True
         solution = self.controller.feedback(self.estimator.estimate.copy(), a)
+        if self._noise_place is not None:
+            solution = self._differentiated(solution)
         self.applied(solution.action if a is None else a)
         return solution
+
+    def _set_noise(self) -> None:
+        """Give the estimator the variances of θ."""
+        if self._noise_place is not None:
+            self.estimator.noise = self.theta[self._noise_place]  # type: ignore[attr-defined]
+
+    def _differentiated(self, solution: Any) -> EstimatedSolution:
+        """A solution with the derivatives through the estimate."""
+        assert self._noise_place is not None
+        n = self.estimator.estimate.size
+        by_noise = self.estimator.sensitivities.states[:, 0, :n].copy()  # type: ignore[attr-defined]
+        known = {part.name: getattr(solution, part.name) for part in fields(RtiSolution)}
+        return EstimatedSolution(**known, place=self._noise_place, by_noise=by_noise)
 
     def applied(self, a: Vector) -> None:
         """Say which action (m,) was applied, where it is not the solution's own."""
@@ -420,6 +563,21 @@ def measured(scenario: Scenario, controller: Controller) -> Controller:
     if not scenario.sensors or table.kind == "none" or not takes_state:
         return controller
     return OutputFeedback.from_scenario(scenario, controller)
+
+
+def _require_noise_of(estimator: Estimator, labels: tuple[str, ...]) -> None:
+    """Raise ParameterError unless an estimator has these noises, and derivatives by them."""
+    theirs = getattr(estimator, "noise_labels", ())
+    if theirs != labels:
+        raise ParameterError(
+            f"θ's block noise is of {', '.join(labels)}; the estimator's noise is of "
+            f"{', '.join(theirs) or 'nothing'}: take a θ that was learned with these sensors"
+        )
+    if getattr(estimator, "sensitivities", None) is None:
+        raise ParameterError(
+            "θ has a block noise, and the estimator does not differentiate by it: make it with "
+            "differentiates=True"
+        )
 
 
 def _of_size(name: str, values: ArrayLike, counted: Sequence[object]) -> Vector:

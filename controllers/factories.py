@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from controllers.converged import ConvergedNmpc
-from controllers.errors import ControllerError
+from controllers.errors import ControllerError, ParameterError
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
@@ -36,7 +36,13 @@ def nmpc(
 
     Raises:
         ControllerError: Another `kind`.
+        ParameterError: θ has an estimator's variances, and the scenario has no sensor.
     """
+    if "noise" in parameters.blocks and not scenario.sensors:
+        raise ParameterError(
+            f"θ has a block noise, variances of an estimator, and scenario '{scenario.name}' has "
+            "no sensor: take a scenario with the sensors of this θ"
+        )
     problem = Problem.from_scenario(scenario)
     settings = scenario.controller
     if kind == "converged":

@@ -165,6 +165,7 @@ class ThetaBlocks:
         *,
         slack_weights: bool = False,
         model_parameters: tuple[str, ...] = (),
+        noise: tuple[str, ...] = (),
     ) -> ThetaBlocks:
         """Blocks of the paper's θ for a problem (paper.tex, Simulations), and optional ones.
 
@@ -176,6 +177,7 @@ class ThetaBlocks:
             slack_weights: Whether to add the linear and quadratic slack weights w_sigma and W_sigma
                 of the predicted stages 1…N.
             model_parameters: Physical parameters of the model that are to be a block p, by name.
+            noise: What the variances of a block `noise` are of (`ExtendedKalmanFilter`).
 
         Raises:
             ModelError: The model has no such parameter.
@@ -232,7 +234,24 @@ class ThetaBlocks:
                 labels=model_parameters,
             )
             blocks.append(parameters)
+        if noise:
+            blocks.append(noise_block(noise))
         return cls(tuple(blocks))
+
+
+def noise_block(labels: tuple[str, ...]) -> ThetaBlock:
+    """The block `noise`: logarithms of variances, so that a change of 1 is a factor of e.
+
+    Args:
+        labels: What the variances are of.
+    """
+    return ThetaBlock(
+        name="noise",
+        shape=(len(labels),),
+        scale=(1.0,) * len(labels),
+        meaning="log variances of the estimator",
+        labels=labels,
+    )
 
 
 def _block(
@@ -260,6 +279,7 @@ class _File(Table):
     hash: str | None = None
     theta: dict[str, Any]
     model_parameters: Names = ()
+    noise: Names = ()
 
 
 @dataclass(frozen=True, repr=False)
@@ -401,6 +421,8 @@ class Parameters(Shown):
         if "p" in self.blocks:
             names = self.blocks.block("p").labels
             document["model_parameters"] = list(names)
+        if "noise" in self.blocks:
+            document["noise"] = list(self.blocks.block("noise").labels)
         return tomli_w.dumps(document)
 
     def save(self, path: str | Path) -> Path:
@@ -442,6 +464,7 @@ class Parameters(Shown):
                 problem,
                 slack_weights=slack_weights,
                 model_parameters=file.model_parameters,
+                noise=file.noise,
             )
             missing = [name for name in blocks.slices if name not in values]
             unknown = [name for name in values if name not in blocks]

@@ -334,6 +334,19 @@ class ExtendedKalmanFilter:
         # Symmetric by its form; the sensor's variance keeps it positive semidefinite.
         self._covariance -= np.outer(gain, across)
 
+    def expected_readings(self, s: ArrayLike, p: ArrayLike) -> Vector:
+        """What the sensors' variables are at a state, (n_y,).
+
+        Args:
+            s: State, (n,).
+            p: All parameters of the model, of which the uncertain ones are taken, (n_p,).
+        """
+        n_states = self._problem.n_states
+        self._output.inputs["z"][:n_states] = s
+        self._output.inputs["z"][n_states:] = np.asarray(p)[self._uncertain]
+        self._output()
+        return self._output.part("y").copy()
+
     def _sizes_of_outputs(self) -> Vector:
         """Size of each sensor's variable over the bounds' widths about the reference, (n_y,)."""
         self._output.inputs["z"][:] = self._reference

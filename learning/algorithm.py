@@ -40,6 +40,7 @@ class Transition(NamedTuple):
         next_penalty: penalty of s₊.
         next_solution: for V(s₊) and π(s₊).
         point, next_point: linearisation points at s and s₊, None unless the rule `needs_points`.
+        y: what the sensors showed at s, (n_y,), NaN where nothing came; None without sensors.
     """
 
     number: int
@@ -55,6 +56,7 @@ class Transition(NamedTuple):
     next_solution: RtiSolution
     point: LinearisationPoint | None
     next_point: LinearisationPoint | None
+    y: Vector | None = None
 
 
 class Update(NamedTuple):
@@ -104,6 +106,8 @@ class Algorithm:
 
     Optional, looked up by name:
 
+    - `under_sensors`, of the class: the rule that takes its place where the scenario has sensors,
+      with the same `Configuration`.
     - `theta` (n_θ,), a property: the final θ so far, where the controller carries another one.
       Log, evaluation, divergence, parameters.toml and summary are of it. Such a rule tries θ on
       purpose, so it never retreats.

@@ -20,6 +20,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
 from learning.errors import PrivilegeError
 from learning.exploration import Strategy
+from learning.gaussian_penalty import expected_penalties
 from learning.retreat import Retreat
 from learning.step import update_without_fit
 
@@ -137,6 +138,17 @@ class TrainingLoop:
         return estimate
 
     @property
+    def known_penalty(self) -> float:
+        """What a rule may know of the present state's penalty: under sensors its expectation."""
+        s = self.known_state
+        estimator = getattr(self._law, "estimator", None)
+        covariance = getattr(estimator, "covariance", None)
+        if self._loop.y is None or covariance is None:
+            return self._penalty(s.tolist())
+        variances = covariance.diagonal()
+        return float(expected_penalties(self._penalty, s[None], variances[None]).sum())
+
+    @property
     def parameters(self) -> Parameters:
         """The final θ so far: the rule's own where it reports one, else the controller's."""
         theta = getattr(self.algorithm, "theta", None)
@@ -231,6 +243,7 @@ class TrainingLoop:
         point: LinearisationPoint | None = loop.point
         number = self.counts.number
         s = self.known_state
+        known_penalty = self.known_penalty
         a, explored = self._choose(solution)
         # V and Q are one where a = π(s): a greedy sample costs one QP.
         q_solution = solution
@@ -249,11 +262,11 @@ class TrainingLoop:
         cost = step.stage_cost + step.penalty
         if solution is None or q_solution is None or next_solution is None:
             return None, cost
-        # J is of the truth; a rule is told the penalty of the state that it knows.
+        # J is of the truth; a rule is told what can be known of it.
         next_s = self.known_state
         known_cost = cost
         if sample.y is not None:
-            known_cost = step.stage_cost + self._penalty(s.tolist())
+            known_cost = step.stage_cost + known_penalty
         needs_points = self.algorithm.needs_points
         transition = Transition(
             number=number,
@@ -265,10 +278,11 @@ class TrainingLoop:
             stage_cost=step.stage_cost,
             cost=known_cost,
             next_s=next_s,
-            next_penalty=self._penalty(next_s.tolist()),
+            next_penalty=self.known_penalty,
             next_solution=next_solution,
             point=point if needs_points else None,
             next_point=loop.point if needs_points else None,
+            y=sample.y,
         )
         return transition, cost
 

@@ -28,6 +28,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import ALL, Count, ModelParameters, Share
 from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
+from learning.model_from_outputs import ModelFromOutputs
 from learning.plant_data import PlantData
 from learning.prediction_errors import SortedErrors, expected_penalties
 from learning.rollout import Rollout, RolloutSamples
@@ -38,6 +39,25 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     """Hyperparameters of `model-based`."""
 
     model_parameters: ModelParameters = ALL
+    # under sensors (`learning.model_from_outputs`)
+    noise: bool = Field(True, description="θ has the variances of the estimator, under sensors")
+    noise_prior: Positive = Field(
+        2.0,
+        description="standard deviation of the prior of these variances' logarithms",
+    )
+    output_samples: Count = Field(
+        1440,
+        description="latest samples to whose readings filter and model are fitted",
+    )
+    fit_noise_rounds: Count = Field(15, description="rounds of that fit")
+    simulated_samples: Count = Field(
+        1500,
+        description="samples of a rollout behind the filter, `burn_in` included",
+    )
+    shrink_samples: Count = Field(
+        480,
+        description="samples below which no back-off shrinks, under sensors",
+    )
     # when an update is due
     first_update: Count = Field(30, description="samples before the first update of θ")
     longest_interval: Count = Field(
@@ -152,6 +172,8 @@ class ModelBased(Algorithm):
     predicts less for the new one.
     """
 
+    learns_from_estimates = True
+    under_sensors = ModelFromOutputs
     Configuration = ModelBasedConfiguration
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080

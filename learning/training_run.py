@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from controllers.economic import tune
+from controllers.estimator import ExtendedKalmanFilter
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.core.protocols import Vector
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import EstimatorTable, Scenario
 from cosim.core.simulation import spawn_seeds
 from cosim.core.training_options import (
     DEFAULT_SAMPLES,
@@ -112,6 +113,16 @@ class TrainingRun(TrainingOptions):
 
     def starting_parameters(self) -> Parameters:
         """θ where the run starts; raises what the function `starting_parameters` raises."""
+        start = self._starting_parameters()
+        table = self.scenario.estimator or EstimatorTable()
+        if not getattr(self.configuration, "noise", False) or table.kind != "ekf":
+            return start
+        if not self.scenario.sensors:
+            return start
+        return ExtendedKalmanFilter.from_scenario(self.scenario).add_noise(start)
+
+    def _starting_parameters(self) -> Parameters:
+        """The same without a block `noise`, but for that of a file."""
         problem = Problem.from_scenario(self.scenario)
         if self.start not in ("backed-off", "cautious"):
             return starting_parameters(problem, self.configuration, self.start)
@@ -268,6 +279,8 @@ def begin_training(
             f"{run.algorithm} learns from exact states, and scenario '{run.scenario.name}' has "
             "sensors: use an algorithm that learns from estimates, such as q-learning"
         )
+    if run.scenario.sensors:
+        algorithm = getattr(algorithm, "under_sensors", algorithm)
     # Each source of randomness has its own stream, so that settings keep runs paired.
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
     strategy = Strategy(run.configuration, run.scenario)
@@ -348,6 +361,9 @@ def starting_parameters(
         )
     # The file's parameters first, in its order, then those that are learned.
     labels: list[str] = []
+    noise: tuple[str, ...] = ()
+    if file is not None and "noise" in file.blocks:
+        noise = file.blocks.block("noise").labels
     if file is not None and "p" in file.blocks:
         labels += file.blocks.block("p").labels
     for name in configuration.learned_parameters(problem.model):
@@ -357,6 +373,7 @@ def starting_parameters(
         problem,
         slack_weights=configuration.parametrisation == "extended",
         model_parameters=tuple(labels),
+        noise=noise,
     )
     # Blocks that the start does not say begin at values of the problem's scale.
     if start == "tuned":

@@ -1,0 +1,83 @@
+"""The variances of an estimator's noises from a plant's readings, in prediction-error form.
+
+The innovations of a filter with the right variances are white, of the variance that the filter
+expects. The variances η (their logarithms) of greatest posterior density are taken: the likelihood
+of all innovations, and a normal prior about what the scenario says. Readings may be late and far
+apart: the filter needs no complete state at any sample.
+
+Source: Ljung, System Identification, 1999, ch. 7 and 10; Gupta and Mehra, IEEE TAC 19(6), 1974.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controllers.estimator import ExtendedKalmanFilter
+from cosim.core.protocols import Array, Vector
+
+REACH = 8.0
+"""Largest distance of a log variance from its prior mean."""
+
+
+def replay(estimator: ExtendedKalmanFilter, readings: Array, actions: Array) -> None:
+    """Run a filter over data; it ends at the last sample, after its correction.
+
+    Args:
+        estimator: the filter, reset here.
+        readings: y_k, NaN where there is none, (M, n_y).
+        actions: u_k, (M, m).
+    """
+    estimator.reset()
+    for k, y in enumerate(readings):
+        if k > 0:
+            estimator.predict(actions[k - 1])
+        estimator.correct(y)
+
+
+def fit_noise(
+    estimator: ExtendedKalmanFilter,
+    readings: Array,
+    actions: Array,
+    prior_mean: Vector,
+    prior_width: float,
+    rounds: int,
+) -> Vector:
+    """The η of greatest posterior density, from the estimator's present η on.
+
+    Args:
+        estimator: a filter that differentiates; it has the result, after the last sample.
+        readings: y_k, (M, n_y).
+        actions: u_k, (M, m).
+        prior_mean: of η, (q,).
+        prior_width: standard deviation of the prior.
+        rounds: of the quasi-Newton method at most.
+
+    Returns:
+        η, (q,).
+    """
+    from scipy.optimize import Bounds, minimize  # noqa: PLC0415 - half a second
+
+    sensitivities = estimator.sensitivities
+    assert sensitivities is not None
+
+    def loss(noise: Vector) -> tuple[float, Vector]:
+        estimator.noise = noise
+        replay(estimator, readings, actions)
+        away = (noise - prior_mean) / prior_width
+        value = float(away @ away) / 2 - estimator.log_likelihood
+        return value, away / prior_width - sensitivities.log_likelihood
+
+    start = estimator.noise
+    with np.errstate(over="ignore", invalid="ignore"):  # of a filter that runs away
+        result = minimize(
+            loss,
+            start,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=Bounds(prior_mean - REACH, prior_mean + REACH),
+            options={"maxiter": rounds, "maxfun": 2 * rounds},
+        )
+    best: Vector = result.x if np.isfinite(result.fun) else start
+    estimator.noise = best
+    replay(estimator, readings, actions)
+    return best

@@ -77,6 +77,10 @@ class ValueConfiguration(Configuration):
         description="width of a cost gradient as a share of the start's, where that is more than "
         "a shift's",
     )
+    noise_width: Positive = Field(
+        1.0,
+        description="width of the logarithms of the estimator's variances, where θ has them",
+    )
     measure_offset: bool = Field(
         True,
         description="c_f becomes the mean of the first prediction errors; false: it starts as it "
@@ -125,6 +129,10 @@ class QLearningConfiguration(ValueConfiguration):
     rule: Literal["kalman", "td", "fit"] = Field(
         "kalman",
         description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
+    )
+    noise: bool = Field(
+        False,
+        description="whether θ has the variances of the estimator, under sensors",
     )
     prior_samples: Count = Field(
         500,
@@ -252,6 +260,8 @@ def prior_deviation(
     for name in ("w_sigma", "W_sigma", "p"):
         if name in start.blocks:
             widths[name] = width * np.abs(start[name])
+    if "noise" in start.blocks:
+        widths["noise"] = np.full(start["noise"].size, settings.noise_width)
     packed = [block.pack(widths[block.name]) for block in start.blocks]
     # An entry of no width would divide by zero where θ is scaled.
     floor = np.finfo(np.float64).tiny ** 0.25

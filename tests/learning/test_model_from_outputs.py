@@ -1,0 +1,111 @@
+"""Filter and back-offs from readings with gaps: the parts by theory, the rule on its preset."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from controllers import ExtendedKalmanFilter
+from controllers.problem import Problem
+from cosim import Scenario
+from cosim.core.scenario import Penalty
+from cosim.core.sensors import Sensors
+from learning import train
+from learning.errors import ConfigurationError
+from learning.gaussian_penalty import expected_penalties
+from learning.innovations import fit_noise
+from learning.training_run import make_run
+
+
+@pytest.mark.parametrize("mean", [-2.0, 0.1, 3.0])
+def test_the_expected_penalty_is_the_integral(mean):
+    """Independent: numerical integration of penalty times density."""
+    penalty = Penalty([0.0], [1.0], [50.0], [7.0])
+    deviation = 0.8
+    ours = expected_penalties(penalty, np.array([[mean]]), np.array([[deviation**2]]))
+
+    def integrand(x):
+        return penalty([x]) * norm.pdf(x, mean, deviation)
+
+    points = [mean - 10 * deviation, 0.0, 1.0, mean + 10 * deviation]
+    pieces = zip(sorted(points)[:-1], sorted(points)[1:], strict=True)
+    theirs = sum(quad(integrand, low, high)[0] for low, high in pieces)
+    assert np.isclose(ours.sum(), theirs, rtol=1e-9)
+
+
+def test_the_expected_penalty_of_a_known_state_is_its_penalty():
+    penalty = Penalty([0.0, 0.0], [1.0, 1.0], [50.0, 3.0], [7.0, 2.0])
+    states = np.array([[-0.5, 0.5], [0.2, 1.7], [0.1, 0.9]])
+    ours = expected_penalties(penalty, states, np.zeros_like(states))
+    assert np.allclose(ours.sum(axis=0), penalty.along(states), rtol=1e-12)
+
+
+def linear_readings(deviations, samples, seed):
+    """Readings of the linear plant of the filter's own tests, with noise of known deviations."""
+    from tests.controllers.test_estimator import linear_problem
+
+    problem: Problem = linear_problem()
+    scenario = Scenario.load("assay")
+    tables = [
+        scenario.sensors[0].model_copy(update={"variable": "a", "deviation": 0.02}),
+        scenario.sensors[1].model_copy(update={"variable": "sum", "every": 3, "deviation": 0.05}),
+    ]
+    estimator = ExtendedKalmanFilter(problem, tables, differentiates=True)
+    from controllers.model import discretise
+
+    step = discretise(problem.model, 1.0, 1)
+    rng = np.random.default_rng(seed)
+    sensors = Sensors(tables)
+    x = problem.reference_state
+    readings = [sensors.start(seed, [x[0], x[0] + 2 * x[1]])]
+    actions = rng.normal(0.0, 0.3, (samples, 1))
+    for k in range(samples - 1):
+        d = deviations * rng.standard_normal(2)
+        x = step(x, actions[k], d, []).full()[:, 0]
+        readings.append(sensors.read(k + 1, [x[0], x[0] + 2 * x[1]]))
+    return estimator, np.array(readings), actions
+
+
+@pytest.mark.slow
+def test_the_variances_that_made_the_data_are_found():
+    """Theory: on a linear plant the likelihood is exact, so that its maximiser is consistent."""
+    true = np.array([0.6, 2.0])
+    estimator, readings, actions = linear_readings(true, 1200, 4)
+    noise = fit_noise(estimator, readings, actions, estimator.noise, 3.0, 25)
+    truth = np.log(np.array([*true, 0.02, 0.05]) ** 2)
+    assert np.abs(noise[:2] - truth[:2]).max() < 0.3
+    assert abs(estimator.noise[0] - noise[0]) == 0.0
+
+
+@pytest.mark.slow
+def test_model_based_fits_filter_and_back_offs_from_a_day_of_readings():
+    """`assay-fouled`: UA2 is found, the filter's variances move, and θ is no more expensive."""
+    training = train(
+        "model-based",
+        "assay-fouled",
+        480,
+        start="cautious",
+        seed=1,
+        evaluation_seeds=2,
+        evaluation_steps=1000,
+    )
+    learned = training.learned
+    UA2 = learned["p"][learned.blocks.block("p").labels.index("UA2")]
+    assert abs(UA2 - 5.2) < 0.3
+    assert np.abs(learned["noise"] - training.start["noise"]).max() > 0.1
+    assert 1.01 * training.start_J > training.J
+
+
+def test_without_a_filter_of_ours_it_says_what_is_missing():
+    scenario = Scenario.load("assay").replace({"estimator": {"kind": "none"}})
+    with pytest.raises(ConfigurationError, match="no estimator of kind 'ekf'"):
+        train("model-based", scenario, 60, start="naive", evaluation_seeds=0)
+
+
+def test_the_block_is_where_sensors_are():
+    blocks = {}
+    for name in ("paper", "assay"):
+        run = make_run("model-based", Scenario.load(name), 60)
+        blocks[name] = run.starting_parameters().blocks
+    assert "noise" not in blocks["paper"]
+    assert blocks["assay"].block("noise").labels[-1] == "sensor P2"

@@ -101,8 +101,8 @@ class Algorithm:
       reset.
     - `needs_q_solution`: whether it reads `Transition.q_solution` where the sample explored.
     - `needs_points`: whether it reads the linearisation points.
-    - `learns_from_estimates`: whether it may run where the scenario has sensors. `s`, `next_s` and
-      the penalties of a transition are then those of the estimated states.
+    - `learns_from_estimates`: whether it may run where the scenario has sensors. `s` and
+      `next_s` of a transition are then estimates, its penalties expectations.
 
     Optional, looked up by name:
 

@@ -243,7 +243,8 @@ class TrainingLoop:
         point: LinearisationPoint | None = loop.point
         number = self.counts.number
         s = self.known_state
-        known_penalty = self.known_penalty
+        # Of the present estimate, which the next sample replaces.
+        known_penalty = 0.0 if loop.y is None else self.known_penalty
         a, explored = self._choose(solution)
         # V and Q are one where a = π(s): a greedy sample costs one QP.
         q_solution = solution

@@ -7,7 +7,7 @@ from scipy.linalg import solve_discrete_are
 
 from controllers import ExtendedKalmanFilter, Model, OutputFeedback, Parameters, Quantity
 from controllers.errors import ParameterError
-from controllers.factories import nmpc, tuned
+from controllers.factories import naive, nmpc
 from controllers.model import discretise
 from controllers.problem import Problem
 from cosim import Scenario
@@ -17,9 +17,9 @@ SAMPLES = 12
 
 
 def with_noise(scenario):
-    """A tuned controller whose θ has the block `noise`, behind the scenario's filter."""
+    """A naive controller whose θ has the block `noise`, behind the scenario's filter."""
     estimator = ExtendedKalmanFilter.from_scenario(scenario)
-    controller = nmpc(scenario, estimator.add_noise(tuned(scenario).parameters))
+    controller = nmpc(scenario, estimator.add_noise(naive(scenario).parameters))
     return OutputFeedback.from_scenario(scenario, controller)
 
 
@@ -220,7 +220,7 @@ def test_the_steady_filter_and_its_derivative_are_those_of_the_riccati_equation(
 def test_the_block_alone_changes_no_action():
     """θ with the filter's own variances in it acts as θ without."""
     scenario = late_and_slow()
-    plain = OutputFeedback.from_scenario(scenario, nmpc(scenario, tuned(scenario).parameters))
+    plain = OutputFeedback.from_scenario(scenario, nmpc(scenario, naive(scenario).parameters))
     laws = (plain, with_noise(scenario))
     readings = readings_of(scenario.sensors, [25.5, 50.0], np.random.default_rng(2))
     for y in readings:

@@ -14,7 +14,11 @@ from learning import train
 from learning.errors import ConfigurationError
 from learning.gaussian_penalty import expected_penalties
 from learning.innovations import fit_noise
+from learning.log import to_csv
+from learning.training import run_training
 from learning.training_run import make_run
+from tests.helpers.training import killed_and_resumed
+from tests.helpers.training import make_run as run_of
 
 
 @pytest.mark.parametrize("mean", [-2.0, 0.1, 3.0])
@@ -79,7 +83,7 @@ def test_the_variances_that_made_the_data_are_found():
 
 @pytest.mark.slow
 def test_model_based_fits_the_filter_to_some_hours_of_readings():
-    """`assay-fouled`: UA2 is found and the filter's variances move, resumed or not."""
+    """`assay-fouled`: UA2 is found and the filter's variances move."""
     training = train(
         "model-based",
         "assay-fouled",
@@ -94,6 +98,24 @@ def test_model_based_fits_the_filter_to_some_hours_of_readings():
     assert abs(UA2 - 5.2) < 0.5
     assert np.abs(learned["noise"] - training.start["noise"]).max() > 0.1
     assert training.updates == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [
+        ("model-based", {"fit_noise_rounds": 2, "simulated_samples": 310, "least_samples": 30}),
+        ("q-learning", {"noise": True, "prior_samples": 20, "step_every": 10}),
+    ],
+)
+def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(algorithm, settings, tmp_path):
+    every = {"samples": 60, "log_every": 20, "evaluate_every": 60, "checkpoint_every": 20}
+    run = run_of(algorithm, "assay", settings, start="tuned", **every)
+    whole = run_training(run)
+    resumed = killed_and_resumed(run, tmp_path, 40)
+    assert to_csv(resumed.rows) == to_csv(whole.rows)
+    assert np.array_equal(resumed.learned.theta, whole.learned.theta)
+    assert not np.array_equal(whole.learned["noise"], whole.start["noise"])
 
 
 def test_without_a_filter_of_ours_it_says_what_is_missing():

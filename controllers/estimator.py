@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from math import log, pi
+from math import log, pi, sqrt
 from typing import Any, Protocol, Self
 
 import casadi as ca
@@ -102,6 +102,8 @@ class ExtendedKalmanFilter:
         noise_labels: What the entries of `noise` are of: each disturbance, the change of each
             uncertain parameter in a sample, each sensor, (q,).
         log_likelihood: Of all readings since the last `reset`, by their innovations.
+        standardised: Innovations of the last `correct` over their expected deviations, (n_y,), NaN
+            where no reading came.
         sensitivities: The derivatives; None where it does not differentiate.
 
     Raises:
@@ -186,6 +188,7 @@ class ExtendedKalmanFilter:
         self._covariance = np.zeros((self._states.size, self._states.size))
         self._covariance[:n, :n] = np.diag(self._initial_deviation**2)
         self.log_likelihood = 0.0
+        self.standardised = np.full(self._delays.size, np.nan)
         if self.sensitivities is not None:
             self.sensitivities.reset()
 
@@ -299,6 +302,7 @@ class ExtendedKalmanFilter:
             raise ControllerError(
                 f"y must be {self._delays.size} readings, NaN where there is none, not {readings}"
             )
+        self.standardised[:] = np.nan
         arrived = np.flatnonzero(~np.isnan(readings))
         # One after the other: their noises are independent, so that nothing is inverted.
         for i in arrived.tolist():
@@ -319,6 +323,7 @@ class ExtendedKalmanFilter:
         variance = slope @ across[first : first + n] + self._sensor_variance[i]
         gain = across / variance
         innovation = reading - output.part("y")[i]
+        self.standardised[i] = innovation / sqrt(variance)
         self.log_likelihood -= (innovation**2 / variance + log(2 * pi * variance)) / 2
         if self.sensitivities is not None:
             self.sensitivities.correct(

@@ -2,11 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import ndtr
 
 from cosim.core.protocols import Array
 from cosim.core.scenario import Penalty
+
+
+def expected_penalties_with_errors(
+    penalty: Penalty,
+    means: Array,
+    variances: Array,
+    errors: Sequence[Array],
+    n_normal: float,
+) -> Array:
+    """The same where some errors of estimates are known, besides a normal law.
+
+    The law is the mean of a Dirichlet process about the normal one: each error that was seen
+    counts as one, the normal law as `n_normal`.
+
+    Args:
+        penalty: bounds and weights.
+        means: estimates μ, (K, n).
+        variances: σ², (K, n).
+        errors: of each state, over their expected deviations, (M_i,).
+        n_normal: weight of the normal law.
+
+    Returns:
+        Penalties of the lower, then of the upper bounds, (2n, K).
+    """
+    n = means.shape[1]
+    penalties = expected_penalties(penalty, means, variances)
+    deviations = np.sqrt(variances)
+    for i, seen in enumerate(errors):
+        states = means[:, i, None] + deviations[:, i, None] * seen
+        for row, excess in ((i, penalty.lower[i] - states), (n + i, states - penalty.upper[i])):
+            violation = np.maximum(excess, 0.0)
+            total = penalty.linear[i] * violation + penalty.quadratic[i] * violation**2
+            by_law = n_normal * penalties[row]
+            penalties[row] = (by_law + total.sum(axis=1)) / (n_normal + len(seen))
+    return penalties
 
 
 def expected_penalties(penalty: Penalty, means: Array, variances: Array) -> Array:

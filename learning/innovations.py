@@ -19,19 +19,25 @@ REACH = 8.0
 """Largest distance of a log variance from its prior mean."""
 
 
-def replay(estimator: ExtendedKalmanFilter, readings: Array, actions: Array) -> None:
+def replay(estimator: ExtendedKalmanFilter, readings: Array, actions: Array) -> Array:
     """Run a filter over data; it ends at the last sample, after its correction.
 
     Args:
         estimator: the filter, reset here.
         readings: y_k, NaN where there is none, (M, n_y).
         actions: u_k, (M, m).
+
+    Returns:
+        Innovations over their expected deviations, (M, n_y), NaN where there is no reading.
     """
+    standardised = np.empty_like(readings)
     estimator.reset()
     for k, y in enumerate(readings):
         if k > 0:
             estimator.predict(actions[k - 1])
         estimator.correct(y)
+        standardised[k] = estimator.standardised
+    return standardised
 
 
 def fit_noise(
@@ -41,7 +47,7 @@ def fit_noise(
     prior_mean: Vector,
     prior_width: float,
     rounds: int,
-) -> Vector:
+) -> tuple[Vector, Array]:
     """The η of greatest posterior density, from the estimator's present η on.
 
     Args:
@@ -53,7 +59,7 @@ def fit_noise(
         rounds: of the quasi-Newton method at most.
 
     Returns:
-        η, (q,).
+        η, (q,), and with it the innovations over their expected deviations, (M, n_y).
     """
     from scipy.optimize import Bounds, minimize  # noqa: PLC0415 - half a second
 
@@ -79,5 +85,4 @@ def fit_noise(
         )
     best: Vector = result.x if np.isfinite(result.fun) else start
     estimator.noise = best
-    replay(estimator, readings, actions)
-    return best
+    return best, replay(estimator, readings, actions)

@@ -54,6 +54,11 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
         1500,
         description="samples of a rollout behind the filter, `burn_in` included",
     )
+    normal_errors: Count = Field(
+        60,
+        description="number of errors of an estimate as which a normal law counts, beside those "
+        "that were seen",
+    )
     shrink_samples: Count = Field(
         480,
         description="samples below which no back-off shrinks, under sensors",

@@ -28,7 +28,7 @@ from cosim.core.sensors import Sensors
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State
 from learning.errors import ConfigurationError
-from learning.gaussian_penalty import expected_penalties
+from learning.gaussian_penalty import expected_penalties_with_errors
 from learning.innovations import fit_noise
 from learning.step import update_without_fit
 
@@ -59,7 +59,7 @@ class ModelFromOutputs(Algorithm):
             )
         self._filter = ExtendedKalmanFilter.from_scenario(self.scenario, differentiates=True)
         self._prior_mean = self._filter.noise
-        self._plant = FittedPlant(self.scenario, start)
+        self._plant = FittedPlant(self.scenario, start, self.configuration.normal_errors)
         problem = Problem.from_scenario(self.scenario)
         true_bounds = {"x_l": problem.state_lower, "x_u": problem.state_upper}
         self._base = start.replace(true_bounds)
@@ -69,6 +69,14 @@ class ModelFromOutputs(Algorithm):
         n_columns = self._delays.size + problem.n_actions
         self._rows: Array = np.zeros((self.configuration.output_samples, n_columns))
         self._n_rows = 0  # since the last sample that is missing
+        # Innovations of the sensors of each state, over their expected deviations.
+        names = [quantity.name for quantity in problem.model.states]
+        self._sensors_of_states = {}
+        for i, sensor in enumerate(self.scenario.sensors or ()):
+            if sensor.variable in names:
+                self._sensors_of_states[names.index(sensor.variable)] = i
+        self._errors: list[Array] = [np.empty(0) for _ in names]
+        self._n_seen = 0  # samples whose innovations are among them
         self._count = 0
         settings = self.configuration
         self._due = max(settings.first_update, settings.least_samples)
@@ -119,7 +127,7 @@ class ModelFromOutputs(Algorithm):
         settings = self.configuration
         present = self.controller.parameters
         self._filter.noise = present["noise"]
-        noise = fit_noise(
+        noise, innovations = fit_noise(
             self._filter,
             *self._data,
             self._prior_mean,
@@ -128,7 +136,9 @@ class ModelFromOutputs(Algorithm):
         )
         parameters = self._filter.parameters
         base = _with_parameters(self._base.replace({"noise": noise}), parameters)
-        self._plant.fit(self._filter, parameters, int(self.rng.integers(2**63)))
+        self._keep_errors(innovations)
+        seed = int(self.rng.integers(2**63))
+        self._plant.fit(self._filter, parameters, self._errors, seed)
 
         lower = present["x_l"] - self._base["x_l"]
         upper = self._base["x_u"] - present["x_u"]
@@ -146,6 +156,15 @@ class ModelFromOutputs(Algorithm):
         update = update_without_fit(present.blocks, present.theta, end, refused=lost)
         return update._replace(lost=lost)
 
+    def _keep_errors(self, innovations: Array) -> None:
+        """Keep those of the samples since the last update, as this fit has them."""
+        new = innovations[-min(self._count - self._n_seen, len(innovations)) :]
+        self._n_seen = self._count
+        for state, sensor in self._sensors_of_states.items():
+            arrived = new[~np.isnan(new[:, sensor]), sensor]
+            kept = np.concatenate([self._errors[state], arrived])
+            self._errors[state] = kept[-self.configuration.output_samples :]
+
     def state_dict(self) -> State:
         """Readings, schedule and prediction; the filter's variances are θ's."""
         return {
@@ -154,6 +173,8 @@ class ModelFromOutputs(Algorithm):
             "count": self._count,
             "due": self._due,
             "predicted_cost": self.predicted_cost,
+            "n_seen": self._n_seen,
+            **{f"errors{i}": errors for i, errors in enumerate(self._errors)},
         }
 
     def load_state_dict(self, state: State) -> None:
@@ -163,6 +184,8 @@ class ModelFromOutputs(Algorithm):
         self._count = state["count"]
         self._due = state["due"]
         self.predicted_cost = state["predicted_cost"]
+        self._n_seen = state["n_seen"]
+        self._errors = [state[f"errors{i}"] for i in range(len(self._errors))]
 
 
 class SimulatedCost(NamedTuple):
@@ -185,9 +208,10 @@ class FittedPlant:
     Args:
         scenario: model, sensors and penalty.
         parameters: θ, for its blocks.
+        n_normal: weight of a normal law beside the errors that were seen.
     """
 
-    def __init__(self, scenario: Scenario, parameters: Parameters) -> None:
+    def __init__(self, scenario: Scenario, parameters: Parameters, n_normal: float) -> None:
         problem = Problem.from_scenario(scenario)
         model = problem.model
         x, u, d, p = model.symbols()
@@ -195,6 +219,7 @@ class FittedPlant:
         results = {"x": next_x, "l": ca.SX(model.economic_cost(x, u, d, p))}
         self._step = StackedFunction(define("fitted", {"s": x, "u": u, "d": d, "p": p}, results))
         self._scenario = scenario
+        self._n_normal = n_normal
         self._model = model
         # The filter's variances are set once for all rollouts: θ need not carry them.
         self._controller = nmpc(scenario, _without_noise(parameters))
@@ -203,14 +228,22 @@ class FittedPlant:
         self._law = OutputFeedback(self._filter, self._controller)
         self._state: dict[str, Vector] = {}
 
-    def fit(self, estimator: ExtendedKalmanFilter, parameters: dict[str, float], seed: int) -> None:
+    def fit(
+        self,
+        estimator: ExtendedKalmanFilter,
+        parameters: dict[str, float],
+        errors: Sequence[Array],
+        seed: int,
+    ) -> None:
         """Take variances, parameters and the present state of a filter that fits the data.
 
         Args:
             estimator: the filter.
             parameters: the uncertain ones, by name.
+            errors: of each state that were seen, over their expected deviations, (M_i,).
             seed: of the noise, which all rollouts meet until the next fit.
         """
+        self._errors = errors
         self._filter.noise = estimator.noise
         state = estimator.state_dict()
         self._state = {name: state[name] for name in ("states", "covariance")}
@@ -269,8 +302,12 @@ class FittedPlant:
             step()
             s = step.part("x").copy()
             y = sensors.read(k + 1, self._measured(s))
-        penalties = expected_penalties(
-            self._scenario.state_penalty, means[burn_in:], variances[burn_in:]
+        penalties = expected_penalties_with_errors(
+            self._scenario.state_penalty,
+            means[burn_in:],
+            variances[burn_in:],
+            self._errors,
+            self._n_normal,
         )
         by_bound = penalties.mean(axis=1)
         mean = float(costs[burn_in:].mean() + by_bound.sum())

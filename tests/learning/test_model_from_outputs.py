@@ -12,7 +12,7 @@ from cosim.core.scenario import Penalty
 from cosim.core.sensors import Sensors
 from learning import train
 from learning.errors import ConfigurationError
-from learning.gaussian_penalty import expected_penalties
+from learning.gaussian_penalty import expected_penalties, expected_penalties_with_errors
 from learning.innovations import fit_noise
 from learning.log import to_csv
 from learning.training import run_training
@@ -42,6 +42,22 @@ def test_the_expected_penalty_of_a_known_state_is_its_penalty():
     states = np.array([[-0.5, 0.5], [0.2, 1.7], [0.1, 0.9]])
     ours = expected_penalties(penalty, states, np.zeros_like(states))
     assert np.allclose(ours.sum(axis=0), penalty.along(states), rtol=1e-12)
+
+
+def test_errors_that_were_seen_count_beside_the_normal_law():
+    """In the limit of many draws of the law both are one; without any it is the normal law's."""
+    penalty = Penalty([0.0], [1.0], [50.0], [7.0])
+    means = np.array([[0.3], [1.4]])
+    variances = np.full((2, 1), 0.5)
+    normal = expected_penalties(penalty, means, variances)
+    draws = norm.ppf((np.arange(20000) + 0.5) / 20000)
+    both = expected_penalties_with_errors(penalty, means, variances, [draws], 1e-3)
+    assert np.allclose(both, normal, rtol=1e-3)
+    none = expected_penalties_with_errors(penalty, means, variances, [np.empty(0)], 60.0)
+    assert np.allclose(none, normal, rtol=1e-14)
+    worst = expected_penalties_with_errors(penalty, means, variances, [np.array([-9.0])], 1.0)
+    seen = penalty.along(means - 9.0 * np.sqrt(variances))
+    assert np.allclose(worst[0], (normal[0] + seen) / 2, rtol=1e-14)
 
 
 def linear_readings(deviations, samples, seed):
@@ -75,10 +91,11 @@ def test_the_variances_that_made_the_data_are_found():
     """Theory: on a linear plant the likelihood is exact, so that its maximiser is consistent."""
     true = np.array([0.6, 2.0])
     estimator, readings, actions = linear_readings(true, 600, 4)
-    noise = fit_noise(estimator, readings, actions, estimator.noise, 3.0, 15)
+    noise, innovations = fit_noise(estimator, readings, actions, estimator.noise, 3.0, 15)
     truth = np.log(np.array([*true, 0.02, 0.05]) ** 2)
     assert np.abs(noise[:2] - truth[:2]).max() < 0.3
-    assert abs(estimator.noise[0] - noise[0]) == 0.0
+    # With the right variances the innovations are standard normal.
+    assert abs(np.nanstd(innovations) - 1.0) < 0.05
 
 
 @pytest.mark.slow

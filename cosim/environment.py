@@ -60,12 +60,16 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         # The FMU's own ranges of its states.
         low, high = self._plant.state_range
         sensors = self.scenario.sensors or ()
+        n_sensors = len(sensors)
         if sensors:
-            low = np.concatenate([np.full(len(sensors), -np.inf), np.full(len(sensors), -1.0)])
-            high = np.full(2 * len(sensors), np.inf)
+            # Readings have noise without bounds; the age of one that never came is −1.
+            least_reading = np.full(n_sensors, -np.inf)
+            least_age = np.full(n_sensors, -1.0)
+            low = np.concatenate([least_reading, least_age])
+            high = np.full(2 * n_sensors, np.inf)
         self._delays: Array = np.array([sensor.delay for sensor in sensors], dtype=float)
-        self._last_readings: Array = np.zeros(len(sensors))
-        self._ages: Array = np.full(len(sensors), -1.0)
+        self._last_readings: Array = np.zeros(n_sensors)
+        self._ages: Array = np.full(n_sensors, -1.0)
         self.observation_space = Box(low, high, dtype=np.float64)
         # Gymnasium may write to its arrays, a scenario's are read-only.
         lower = self.scenario.action_lower.copy()
@@ -92,11 +96,13 @@ class PlantEnv(gymnasium.Env[Array, Array]):
             The observation, and an empty dictionary.
         """
         super().reset(seed=seed)
-        unknown = set(options or ()) - {"initial_state"}
+        given = options or {}
+        unknown = given.keys() - {"initial_state"}
         if unknown:
             raise PlantError(f"unknown reset option {sorted(unknown)}; there is initial_state")
-        start = (options or {}).get("initial_state")
+        start = given.get("initial_state")
         if seed is None:
+            # Gymnasium's generator, which its first seeded reset has set.
             plant_seed = int(self.np_random.integers(1 << 63))
         else:
             # The noise of a simulation on this seed.
@@ -114,7 +120,9 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         if y is None:
             return s
         arrived = ~np.isnan(y)
-        older = np.where(self._ages >= 0.0, self._ages + 1.0, -1.0)
+        has_reading = self._ages >= 0.0
+        older = np.where(has_reading, self._ages + 1.0, -1.0)
+        # A reading is as old as its delay when it arrives.
         self._ages = np.where(arrived, self._delays, older)
         self._last_readings = np.where(arrived, y, self._last_readings)
         return np.concatenate([self._last_readings, self._ages])
@@ -133,7 +141,9 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         info = {"stage_cost": stage_cost, "penalty": penalty, "disturbance": disturbance}
         self._states.append(s)
         self._actions.append(applied)
-        return self._observation(s, y), -(stage_cost + penalty), False, False, info
+        observation = self._observation(s, y)
+        reward = -(stage_cost + penalty)
+        return observation, reward, False, False, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the last samples as an RGB image (height, width, 3); None without a render mode."""
@@ -143,8 +153,10 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         from cosim.figures.trajectory import episode_image  # noqa: PLC0415
 
         first = self._plant.k - len(self._actions)
+        n_actions = len(self.scenario.plant.actions)
         states = np.array(self._states)
-        actions = np.array(self._actions).reshape(-1, len(self.scenario.plant.actions))
+        # Right after a reset there is no action, and the array has one axis.
+        actions = np.array(self._actions).reshape(-1, n_actions)
         return episode_image(self.scenario, self._plant.units, first, states, actions)
 
     def close(self) -> None:
@@ -178,8 +190,10 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         self._scenario = task
         width = task.state_upper - task.state_lower
         magnitude = np.abs(task.reference_state)
-        self.state_scale: Array = SHARE * np.where(magnitude > 0, magnitude, width)
+        size = np.where(magnitude > 0, magnitude, width)
+        self.state_scale: Array = SHARE * size
         self.reference_cost = task.controller.reference_cost
+        # A cost of 0 gives no scale.
         self.cost_scale = SHARE * abs(self.reference_cost) or 1.0
         # A bound that is none may exceed the floats of 32 bits.
         with np.errstate(over="ignore"):
@@ -190,7 +204,9 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         self.action_space = Box(-ones, ones, dtype=np.float32)
 
     def _normalised(self, s: NDArray[np.floating]) -> Single:
-        return ((s - self._scenario.reference_state) / self.state_scale).astype(np.float32)
+        deviation = s - self._scenario.reference_state
+        scaled = deviation / self.state_scale
+        return scaled.astype(np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -211,17 +227,22 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         values = np.asarray(action, dtype=np.float64)
         if values.shape != lower.shape:
             raise PlantError(f"an action has shape {lower.shape}, not {values.shape}")
-        share = 0.5 * (np.clip(values, -1.0, 1.0) + 1.0)
+        # An agent's noise may carry it beyond; the actuators saturate.
+        clipped = np.clip(values, -1.0, 1.0)
+        share = 0.5 * (clipped + 1.0)
         physical = lower + share * (upper - lower)
         s, reward, terminated, truncated, info = self.env.step(physical)
-        scaled = (self.reference_cost + float(reward)) / self.cost_scale
+        # The reward is minus the cost: its excess is counted from the operating point's.
+        excess = self.reference_cost + float(reward)
+        scaled = excess / self.cost_scale
         return self._normalised(s), scaled, terminated, truncated, info
 
 
-for _name, _entry_point in (("Evaporator", "PlantEnv"), ("EvaporatorNormalised", "NormalisedEnv")):
-    if f"cosim/{_name}-v0" not in gymnasium.registry:
-        gymnasium.register(
-            f"cosim/{_name}-v0",
-            f"cosim.environment:{_entry_point}",
-            max_episode_steps=EPISODE_STEPS,
-        )
+_ENVIRONMENTS = {
+    "cosim/Evaporator-v0": "cosim.environment:PlantEnv",
+    "cosim/EvaporatorNormalised-v0": "cosim.environment:NormalisedEnv",
+}
+for _name, _entry_point in _ENVIRONMENTS.items():
+    # Gymnasium warns of a name that is registered twice, as by a module that is loaded anew.
+    if _name not in gymnasium.registry:
+        gymnasium.register(_name, _entry_point, max_episode_steps=EPISODE_STEPS)

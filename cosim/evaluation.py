@@ -262,7 +262,9 @@ def _distinct_seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
 
 
 def _seed_numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
-    # An array without dimensions is a number.
+    """The seeds in their order, those below S for a number S."""
+    # Texts and mappings can be iterated over, but are no lists of seeds; an array without
+    # dimensions is a number.
     no_list = isinstance(seeds, str | bytes | Mapping) or getattr(seeds, "ndim", 1) == 0
     if no_list or not isinstance(seeds, Iterable):
         count = whole_number("seeds", seeds, 1, EvaluationError)
@@ -368,7 +370,8 @@ class Evaluation(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """A row for each controller, as given, and seed; NaN where an indicator is undefined."""
-        frame = self._rows(self.columns).assign(**self.facts)
+        frame = self._rows(self.columns)
+        frame = frame.assign(**self.facts)
         frame["parameters_hash"] = frame.controller.map(self.parameters)
         cost = frame.J.to_numpy()
         # The rows of all controllers are on the same seeds, one controller after the other.
@@ -382,7 +385,10 @@ class Evaluation(Result):
         return frame[EVALUATION_COLUMNS].astype({"failures": int})
 
     def _rows(self, frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-        rows = pd.concat({name: frames[name] for name in self.controllers})
+        """Frames of the controllers one below the other, with controller and seed as columns."""
+        # The optimum's frame may be there without being asked for.
+        asked_for = {name: frames[name] for name in self.controllers}
+        rows = pd.concat(asked_for)
         return rows.rename_axis(["controller", "seed"]).reset_index()
 
     def to_csv(self) -> str:
@@ -393,19 +399,21 @@ class Evaluation(Result):
         """Regret (J where J* is not known) with its intervals; economic cost against violation."""
         from cosim.figures.evaluation import evaluation_figure  # noqa: PLC0415 - matplotlib
 
+        columns = {name: self.columns[name] for name in self.controllers}
+        runs = f"{self.facts['steps']} samples × {len(self.seeds)} seeds"
         return evaluation_figure(
-            {name: self.columns[name] for name in self.controllers},
-            title=f"{self.facts['scenario']}, {self.facts['steps']} samples × {len(self.seeds)} "
-            "seeds, the same disturbances for all",
+            columns,
+            title=f"{self.facts['scenario']}, {runs}, the same disturbances for all",
             optimal=None if self.optimum is None else self.optimal,
         )
 
     def table(self) -> str:
         """Means over the seeds by controller, as a Markdown table; a regret of 1 is 100 %."""
         names = ["J", "regret", "economic_cost", "violating_share", "failures"]
-        means = self.to_pandas().groupby("controller", sort=False)[names].mean()
-        rows = means.map("{:.6g}".format).reset_index().to_numpy().tolist()
-        return markdown_table(("controller", *names), rows)
+        by_controller = self.to_pandas().groupby("controller", sort=False)
+        means = by_controller[names].mean()
+        texts = means.map("{:.6g}".format).reset_index()
+        return markdown_table(("controller", *names), texts.to_numpy().tolist())
 
     def write(self, folder: str | Path) -> None:
         """Write evaluation.csv, evaluation.png, timing.csv and scenario.toml, all or none."""
@@ -416,10 +424,10 @@ class Evaluation(Result):
         """Write the files of `write` one after the other."""
         self.plot(folder / "evaluation.png")
         (folder / "scenario.toml").write_text(self.scenario.to_toml(), "utf-8")
-        clock = self._rows(self.timing).round(3)
-        for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock)):
+        tables = {EVALUATION: self.to_pandas(), TIMING: self._rows(self.timing).round(3)}
+        for name, table in tables.items():
             # Write row by row: the text of all takes ten times the memory of the numbers.
-            frame.to_csv(folder / name, index=False, lineterminator="\n")
+            table.to_csv(folder / name, index=False, lineterminator="\n")
 
     def summary(self) -> dict[str, Any]:
         """The evaluation as a JSON document: controllers, comparisons, provenance, timing.
@@ -610,29 +618,42 @@ def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) ->
 
 def _read_trajectory(path: Path, scenario: Scenario) -> tuple[int, _Recorded, int]:
     """Seed, player and number of samples of a file."""
-    number = re.search(r"(\d+)$", path.stem)
-    if number is None:
-        raise EvaluationError(f"'{path}': a file's name ends in its seed, as run-7.csv")
-    seed = int(number[1])
-    if seed >= 1 << 64:
-        raise EvaluationError(f"'{path}': its seed must be below 2⁶⁴")
+    seed = _seed_of_file(path)
+    plant = scenario.plant
     try:
         with warnings.catch_warnings():
             # Rows of unlike length, which pandas would fill up.
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(path, index_col=False)
+        # Titles may have units: `X2 [%]`.
         table = table.rename(columns=lambda title: title.partition(" [")[0].strip())
-        plant = scenario.plant
-        numbers = table[[*plant.states, *plant.actions]].astype(float)
-        if numbers.shape[1] != len(plant.states) + len(plant.actions):
+        names = [*plant.states, *plant.actions]
+        numbers = table[names].astype(float)
+        # Pandas gives all columns of a name.
+        if numbers.shape[1] != len(names):
             raise ValueError("two columns have one name")
     except (OSError, ValueError, KeyError, TypeError, OverflowError, Warning) as error:
         reason = " ".join(str(error).split())
         raise EvaluationError(f"'{path}' is no trajectory: {reason}") from None
     # A simulation would clip them, and judge another run than the file's.
     actions = numbers[list(plant.actions)].to_numpy()
-    inside = (actions >= scenario.action_lower) & (actions <= scenario.action_upper)
+    above = actions >= scenario.action_lower
+    below = actions <= scenario.action_upper
+    # A missing one is no number, and so neither.
+    inside = (above & below).all(axis=1)
     if not len(actions) or not inside.all():
-        k = 0 if not len(actions) else int(np.argmin(inside.all(axis=1)))
+        k = int(np.argmin(inside)) if len(actions) else 0
         raise EvaluationError(f"'{path}': the action at sample {k} is missing or beyond its bounds")
-    return seed, _Recorded(path, numbers[list(plant.states)], actions), len(actions)
+    player = _Recorded(path, numbers[list(plant.states)], actions)
+    return seed, player, len(actions)
+
+
+def _seed_of_file(path: Path) -> int:
+    """The number at the end of a file's name."""
+    number = re.search(r"(\d+)$", path.stem)
+    if number is None:
+        raise EvaluationError(f"'{path}': a file's name ends in its seed, as run-7.csv")
+    seed = int(number[1])
+    if seed >= 1 << 64:
+        raise EvaluationError(f"'{path}': its seed must be below 2⁶⁴")
+    return seed

@@ -88,7 +88,8 @@ def _modules_of(part: Any) -> list[str]:
         part = part.func
     if not isinstance(part, str):
         return [getattr(part, "__module__", None) or type(part).__module__]
-    target = (registered(ALGORITHMS) | registered(CONTROLLERS)).get(part, part)
+    by_name = registered(ALGORITHMS) | registered(CONTROLLERS)
+    target = by_name.get(part, part)
     module = target.partition(":")[0]
     if not TARGET.fullmatch(target) or module.partition(".")[0] in OURS:
         return []
@@ -126,8 +127,11 @@ def code_hash() -> str:
     for package in OURS:
         for path in sorted((ROOT / package).rglob("*")):
             relative = path.relative_to(ROOT)
-            counts = path.suffix in CODE_SUFFIXES and not ASIDE & set(relative.parts)
-            if counts and path.is_file():
-                digest.update(f"{relative.as_posix()}\0".encode())
-                digest.update(hashlib.sha256(path.read_bytes()).digest())
+            is_aside = bool(ASIDE & set(relative.parts))
+            if is_aside or path.suffix not in CODE_SUFFIXES or not path.is_file():
+                continue
+            # The name counts, too: a module is found by it.
+            content = hashlib.sha256(path.read_bytes())
+            digest.update(f"{relative.as_posix()}\0".encode())
+            digest.update(content.digest())
     return digest.hexdigest()[:16]

@@ -158,7 +158,10 @@ def check_model(
 
 def _name(fmu: str | Path, archive: UnpackedFmu) -> str:
     """The FMU as a scenario names it."""
-    return str(fmu) if str(fmu) in SHIPPED_FMUS else archive.path.as_posix()
+    name = str(fmu)
+    if name in SHIPPED_FMUS:
+        return name
+    return archive.path.as_posix()
 
 
 def _drafted(
@@ -325,8 +328,11 @@ def _box(
     bounded: bool,
 ) -> tuple[Array, Array]:
     """Between the bounds if wanted and where both are finite, else about the start value."""
-    centre = np.clip(np.asarray(start, dtype=np.float64), lower, upper)
-    reach = SHARE_OF_START * np.where(centre != 0, np.abs(centre), 1.0)
+    values = np.asarray(start, dtype=np.float64)
+    centre = np.clip(values, lower, upper)
+    # What starts at 0 says nothing of its size.
+    size = np.where(centre != 0, np.abs(centre), 1.0)
+    reach = SHARE_OF_START * size
     fills = np.isfinite(lower) & np.isfinite(upper) & bounded
     low = np.where(fills, lower, np.maximum(centre - reach, lower))
     high = np.where(fills, upper, np.minimum(centre + reach, upper))
@@ -351,10 +357,13 @@ def _parameter_remarks(task: Scenario, archive: UnpackedFmu, model: Model) -> li
         variable = archive.variable(quantity.name)
         if variable is None or variable.causality != "parameter":
             continue
-        value = task.plant.parameters.get(quantity.name, start_value(archive, quantity.name))
-        if abs(float(value) - quantity.nominal) > 1e-9 * max(abs(quantity.nominal), 1e-300):
+        start = start_value(archive, quantity.name)
+        value = float(task.plant.parameters.get(quantity.name, start))
+        # Both may have been written with other digits of one number.
+        allowed = 1e-9 * max(abs(quantity.nominal), 1e-300)
+        if abs(value - quantity.nominal) > allowed:
             remarks.append(
-                f"parameter {quantity.name} is {float(value):g} in the FMU and "
+                f"parameter {quantity.name} is {value:g} in the FMU and "
                 f"{quantity.nominal:g} in the model"
             )
     return remarks
@@ -382,66 +391,93 @@ def _differences(
     """The largest difference in each state, in the cost and in each output."""
     plant = task.plant
     count = len(samples.x)
+    # What the FMU shows of disturbances and outputs, by name.
     read = dict(zip(plant.disturbances, samples.read.T, strict=True))
     d = np.empty((len(model.disturbances), count))
+    point: dict[str, Array] = dict(zip(plant.states, samples.x.T, strict=True))
+    point |= dict(zip(plant.actions, samples.u.T, strict=True))
     for i, quantity in enumerate(model.disturbances):
+        # A disturbance that the FMU does not show has its nominal value.
         d[i] = read.get(quantity.name, quantity.nominal)
+        point[quantity.name] = d[i]
     p = np.tile(model.nominal_parameters[:, None], (1, count))
     arguments = (samples.x.T, samples.u.T, d, p)
     next_x = _next_states(model, task.sampling_time, arguments)
-    drawn = {quantity.name: values for quantity, values in zip(model.disturbances, d, strict=True)}
-    point: dict[str, Array] = dict(zip(plant.states, samples.x.T, strict=True))
-    point |= dict(zip(plant.actions, samples.u.T, strict=True))
-    point |= drawn
-
-    def compared(name: str, unit: str, fmu: Array, ours: Array, scale: float) -> Difference:
-        if not np.isfinite(ours).all():
-            worst = int(np.argmin(np.isfinite(ours)))
-            place = ", ".join(f"{key} = {values[worst]:.5g}" for key, values in point.items())
-            raise ModelError(f"model '{model.name}' gives no finite number for {name} at {place}")
-        gaps = np.abs(fmu - ours)
-        worst = int(np.argmax(gaps))
-        gap = float(gaps[worst])
-        # What does not vary is compared with its own size.
-        reference = scale or float(np.abs(fmu).max())
-        share = gap / reference if reference else (inf if gap else 0.0)
-        where = {key: float(values[worst]) for key, values in point.items()}
-        return Difference(name, unit, gap, share, float(fmu[worst]), float(ours[worst]), where)
-
     result = []
     for i, name in enumerate(plant.states):
-        movement = float(np.abs(samples.next_x[:, i] - samples.x[:, i]).max())
+        of_fmu = samples.next_x[:, i]
+        # A slow state is the same in both for lack of time: its movement is what counts.
+        movement = float(np.abs(of_fmu - samples.x[:, i]).max())
         title = f"{name} a sample later"
         unit = archive.unit(name)
-        result.append(compared(title, unit, samples.next_x[:, i], next_x[i], movement))
+        result.append(_compare(model, title, unit, of_fmu, next_x[i], movement, point))
 
-    def at_its_time(name: str) -> tuple[Array, Array, Array, Array]:
-        """Arguments of the model at the time to which the FMU's output belongs."""
-        if kinds.get(name) is OutputKind.END:
-            return (next_x, *arguments[1:])
-        return arguments
+    def compare_output(name: str, function: ca.Function, of_fmu: Array) -> Difference:
+        """Compare at the time to which the FMU's output belongs."""
+        at_end = kinds.get(name) is OutputKind.END
+        states = next_x if at_end else samples.x.T
+        of_model = _evaluate(function, (states, *arguments[1:]))[0]
+        spread = float(np.ptp(of_fmu))
+        return _compare(model, name, archive.unit(name), of_fmu, of_model, spread, point)
 
-    name = plant.stage_cost
-    ours = _evaluated(economic_cost(model), at_its_time(name))
-    spread = float(np.ptp(samples.cost))
-    result.append(compared(name, archive.unit(name), samples.cost, ours[0], spread))
+    result.append(compare_output(plant.stage_cost, economic_cost(model), samples.cost))
     symbols = model.symbols()
     for name, output in model.outputs.items():
-        if name not in read:
-            continue
-        function = ca.Function("y", list(symbols), [output(*symbols)])
-        ours = _evaluated(function, at_its_time(name))
-        spread = float(np.ptp(read[name]))
-        result.append(compared(name, archive.unit(name), read[name], ours[0], spread))
+        if name in read:
+            function = ca.Function("y", list(symbols), [output(*symbols)])
+            result.append(compare_output(name, function, read[name]))
     return result
 
 
-def _evaluated(function: ca.Function, arguments: tuple[Array, ...]) -> Array:
+def _compare(
+    model: Model,
+    name: str,
+    unit: str,
+    of_fmu: Array,
+    of_model: Array,
+    scale: float,
+    point: Mapping[str, Array],
+) -> Difference:
+    """The largest difference in a quantity, and where it is.
+
+    Args:
+        model: For messages.
+        name: What is compared.
+        unit: Its unit.
+        of_fmu: Its values in the FMU, (points,).
+        of_model: Its values in the model, (points,).
+        scale: How much it varies, to which the difference is related.
+        point: Values of all variables at the points, by name, (points,) each.
+
+    Raises:
+        ModelError: The model has no finite number at a point.
+    """
+    finite = np.isfinite(of_model)
+    if not finite.all():
+        first = int(np.argmin(finite))
+        place = ", ".join(f"{key} = {values[first]:.5g}" for key, values in point.items())
+        raise ModelError(f"model '{model.name}' gives no finite number for {name} at {place}")
+    gaps = np.abs(of_fmu - of_model)
+    worst = int(np.argmax(gaps))
+    gap = float(gaps[worst])
+    # What does not vary is compared with its own size.
+    reference = scale or float(np.abs(of_fmu).max())
+    share = inf if gap else 0.0
+    if reference:
+        share = gap / reference
+    where = {key: float(values[worst]) for key, values in point.items()}
+    return Difference(name, unit, gap, share, float(of_fmu[worst]), float(of_model[worst]), where)
+
+
+def _evaluate(function: ca.Function, arguments: tuple[Array, ...]) -> Array:
     """A function's values (rows, points) at the columns of its arguments."""
     count = arguments[0].shape[1]
-    columns = [ca.DM(values) if values.size else ca.DM.zeros(0, count) for values in arguments]
-    values: Array = function.map(count)(*columns).full()
-    return values
+    columns = []
+    for values in arguments:
+        # CasADi takes an array without rows for one without columns, too.
+        columns.append(ca.DM(values) if values.size else ca.DM.zeros(0, count))
+    result: Array = function.map(count)(*columns).full()
+    return result
 
 
 def _next_states(model: Model, sampling_time: float, arguments: tuple[Array, ...]) -> Array:
@@ -456,10 +492,12 @@ def _next_states(model: Model, sampling_time: float, arguments: tuple[Array, ...
         step = discretise(model, sampling_time / substeps, 1)
         state = x
         for _ in range(substeps):
-            state = _evaluated(step, (state, *held))
+            state = _evaluate(step, (state, *held))
         if before is not None:
             change = np.abs(state - before).max(axis=1)
-            size = np.abs(state).max(axis=1) + np.abs(state - x).max(axis=1)
+            movement = np.abs(state - x).max(axis=1)
+            size = np.abs(state).max(axis=1) + movement
+            # A state that is 0 throughout has no size.
             if (change <= ACCURATE * size + 1e-300).all():
                 return state
         before = state

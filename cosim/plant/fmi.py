@@ -98,14 +98,16 @@ class UnpackedFmu:
         scale = max(1.0, abs(start), abs(nominal))
         is_integer = variable is not None and variable.type not in _REALS
 
-        def limit(field: str, none: float) -> float:
+        def limit(field: str, unbounded: float) -> float:
             stated = getattr(variable, field, None)
+            # The variable's own bound goes before its type's.
             if stated is None:
                 stated = getattr(declared, field, None)
-            value = number(stated, none)
-            if is_integer and value in _ENDS:
-                return none
-            return value if abs(value) < NO_BOUND * scale else none
+            value = number(stated, unbounded)
+            is_end = is_integer and value in _ENDS
+            if is_end or not abs(value) < NO_BOUND * scale:
+                return unbounded
+            return value
 
         return limit("min", -inf), limit("max", inf)
 
@@ -786,38 +788,52 @@ class Instance(ABC):
     def _exchange(self, places: Sequence[Place], verb: str) -> tuple[Any, Callable[[], None]]:
         """A buffer for a number of each place, and a function that sets or gets them all."""
         if self._all_real(places):
-            buffer = (ctypes.c_double * len(places))()
-            name = f"{verb}{self.real}"
-            function = self._function(name)
-            arguments = self._arguments([place.reference for place in places], buffer)
-
-            def exchange() -> None:
-                status = function(*arguments)
-                if status and status != WARNING:
-                    self.fail(name, status)
-
-            return buffer, exchange
+            return self._exchange_reals(places, verb)
         # Not every integer of 64 bits is a double: what is set is a list.
         count = len(places)
         numbers: Any = [0.0] * count if verb == "Set" else (ctypes.c_double * count)()
+        # The entries of one array are exchanged in one call, with one buffer.
         variables: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
+        calls = []
         for place in places:
-            suffix, ctype = self.setters[place.type]
-            values = (ctype * len(place.starts))()
-            values[:] = [_as(values, start) for start in place.starts]
-            call = f"{verb}{suffix}", self._arguments([place.reference], values), values
-            variables.setdefault(place[:2], call)
-        calls = [(*variables[place[:2]], place.element) for place in places]
+            variable = place[:2]
+            if variable not in variables:
+                suffix, ctype = self.setters[place.type]
+                values = (ctype * len(place.starts))()
+                values[:] = [_as(values, start) for start in place.starts]
+                arguments = self._arguments([place.reference], values)
+                variables[variable] = (f"{verb}{suffix}", arguments, values)
+            calls.append((*variables[variable], place.element))
 
         def convert() -> None:
-            for i, (name, arguments, values, k) in enumerate(calls):
+            for i, (name, arguments, values, element) in enumerate(calls):
                 if verb == "Set":
-                    values[k] = _as(values, numbers[i])
+                    values[element] = _as(values, numbers[i])
                 self._call(name, *arguments)
                 if verb == "Get":
-                    numbers[i] = values[k]
+                    numbers[i] = values[element]
 
         return numbers, convert
+
+    def _exchange_reals(
+        self,
+        places: Sequence[Place],
+        verb: str,
+    ) -> tuple[Any, Callable[[], None]]:
+        """`_exchange` of FMI's reals alone: one call for all, without a conversion."""
+        buffer = (ctypes.c_double * len(places))()
+        name = f"{verb}{self.real}"
+        function = self._function(name)
+        references = [place.reference for place in places]
+        arguments = self._arguments(references, buffer)
+
+        # It runs several times a sample: the status is looked at here, not in another call.
+        def exchange() -> None:
+            status = function(*arguments)
+            if status and status != WARNING:
+                self.fail(name, status)
+
+        return buffer, exchange
 
     def change_start(self, place: Place, value: float) -> None:
         """Replace a start value for the next reset.
@@ -943,8 +959,9 @@ class Instance(ABC):
             PlantError: the FMU refuses them.
         """
         self.require_serialised_state()
-        buffer = ctypes.create_string_buffer(data, len(data))
-        size = ctypes.c_size_t(len(data))
+        n_bytes = len(data)
+        buffer = ctypes.create_string_buffer(data, n_bytes)
+        size = ctypes.c_size_t(n_bytes)
         self._call(self._deserialise, self._component, buffer, size, ctypes.byref(handle))
 
     def _require(self, flag: str, ability: str) -> None:
@@ -1132,12 +1149,13 @@ class Fmi3Instance(Instance):
         if self._intermediate is None or not self._interface.providesIntermediateUpdate:
             return {}
         # fmpy does not read the attribute, an xs:boolean.
-        elements = ElementTree.parse(self.fmu.folder / DESCRIPTION).iter()
+        description = ElementTree.parse(self.fmu.folder / DESCRIPTION)
         offered = set()
-        for element in elements:
+        for element in description.iter():
             if element.get("intermediateUpdate") in ("true", "1"):
                 offered.add(element.get("valueReference"))
-        states = {place.reference for place in self._places[2]}
+        _, _, state_places = self._places
+        states = {place.reference for place in state_places}
         if not {str(state) for state in states} <= offered:
             return {}
         return {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}
@@ -1149,12 +1167,16 @@ class Fmi3Instance(Instance):
                 self._get_states()
                 self._intermediate(time, self.states_view.copy())
             except BaseException as error:
-                self._raised = error  # ctypes would print and drop it
+                # Kept until the step returns: ctypes would print and drop it.
+                self._raised = error
 
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
-        pointers = (ctypes.c_uint * len(references))(*references)
-        counts = ctypes.c_size_t(len(references)), ctypes.c_size_t(len(values))
-        return (self._component, pointers, counts[0], values, counts[1])
+        n_references = len(references)
+        array = (ctypes.c_uint * n_references)(*references)
+        # An array variable has one reference and several values.
+        count = ctypes.c_size_t(n_references)
+        n_values = ctypes.c_size_t(len(values))
+        return (self._component, array, count, values, n_values)
 
     def advance(self, time: float) -> None:
         """Step as in FMI 2.0; an FMU that ends the step early is an error."""

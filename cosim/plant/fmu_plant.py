@@ -103,6 +103,7 @@ class FmuPlant:
         self.penalty = self.scenario.state_penalty
         self._seeds = wiring.seeds
         self._initial = wiring.initial
+        # The initial state that the FMU was given last.
         self._asked = list(plant.initial_state)
         self._elsewhere = False
         self._n = len(plant.states)
@@ -117,6 +118,7 @@ class FmuPlant:
         # What the FMU was seen to do decides, not what its description says.
         self._probe = probe_of(subject_of(self.scenario, archive, wiring))
         self._reading = self._probe.reading
+        # Where a probe cannot tell, the scenario may say which instant an output belongs to.
         if plant.outputs is not None:
             self._reading = self._probe.stated(plant.outputs)
         # A scenario with a model of its plant is for comparisons with the optimum.
@@ -159,7 +161,10 @@ class FmuPlant:
         bare = self._sensors is None and self._signals is None
         self.drivable = fmi.drivable and in_one_step and bare
         self._drive_signals = fmi.channel(wiring.signals)
-        self._changes = {k: fmi.writer(*change) for k, change in wiring.changes().items()}
+        self._changes = {}
+        for k, (places, values) in wiring.changes().items():
+            self._changes[k] = fmi.writer(places, values)
+        # Bound once: a step looks nothing up that stays the same.
         self._advance = fmi.advance if self._steps == 1 else self._advance_in_steps
         self._inputs = fmi.inputs
         self._outputs = fmi.outputs
@@ -502,25 +507,27 @@ class FmuPlant:
         self._elsewhere = state is not None
 
     def _refuse_output(self, k: int) -> NoReturn:
+        """Raise PlantError with the variables that are no finite numbers."""
         table = self.scenario.plant
+        sensed = [sensor.variable for sensor in self.scenario.sensors or ()]
         values = {table.stage_cost: self._outputs[0]}
-        variables = [sensor.variable for sensor in self.scenario.sensors or ()]
-        values |= dict(zip((*table.states, *variables), self._exchanged, strict=True))
-        bad = ", ".join(f"{name} = {x}" for name, x in values.items() if not isfinite(x))
-        raise PlantError(f"FMU '{self.fmu_path.name}' returned {bad} at step {k}")
+        values |= dict(zip((*table.states, *sensed), self._exchanged, strict=True))
+        bad = [f"{name} = {value}" for name, value in values.items() if not isfinite(value)]
+        raise PlantError(f"FMU '{self.fmu_path.name}' returned {', '.join(bad)} at step {k}")
 
 
 def _units(scenario: Scenario, archive: UnpackedFmu) -> dict[str, str]:
     """Units of a scenario's variables, readings, estimates and signals, by name."""
     plant = scenario.plant
-    names = [*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost]
     sensors = scenario.sensors or ()
-    names += [sensor.variable for sensor in sensors]
+    sensed = [sensor.variable for sensor in sensors]
+    names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost, *sensed)
     units = {name: archive.unit(name) for name in names}
-    for sensor, name in zip(sensors, scenario.measurement_names, strict=True):
-        units[name] = units[sensor.variable]
-    for name, estimate in zip(plant.states, scenario.estimate_names, strict=False):
-        units[estimate] = units[name]
+    # A measurement and an estimate have the unit of what they are of.
+    for name, variable in zip(scenario.measurement_names, sensed, strict=True):
+        units[name] = units[variable]
+    for name, state in zip(scenario.estimate_names, plant.states, strict=False):
+        units[name] = units[state]
     for signal, name in zip(scenario.valued_signals, scenario.signal_names, strict=True):
         # That of what it drives, or is; a price has none.
         target = signal.plant or signal.bounded_state or signal.reference

@@ -35,7 +35,9 @@ def start_parameters(scenario: Scenario, fmu: UnpackedFmu) -> dict[str, str]:
         PlantError: The FMU does not run as this scenario's plant.
     """
     states = scenario.plant.states
-    initial = dict(zip(states, _initial_states(scenario, fmu, {}, ()), strict=True))
+    # Where the FMU starts by itself.
+    values_at_start = _initial_states(scenario, fmu, {}, ())
+    initial = dict(zip(states, values_at_start, strict=True))
     parameters: dict[str, str] = {}
     values: dict[str, float] = {}
     for state in states:
@@ -93,13 +95,20 @@ def split_name(name: str) -> tuple[str, str, str]:
 
     Dots inside brackets and quotes part nothing.
     """
+    # What is quoted, what is in brackets, a dot, other text, or a sign that closes nothing.
     pieces = re.findall(r"'[^']*'|\[[^\]]*\]|\.|[^.'\[]+|.", name)
-    last_dot = max((i for i, piece in enumerate(pieces) if piece == "."), default=-1)
-    path = "".join(pieces[: last_dot + 1])
-    rest = pieces[last_dot + 1 :]
+    path: list[str] = []
+    rest: list[str] = []
+    for piece in pieces:
+        rest.append(piece)
+        if piece == ".":
+            path += rest
+            rest = []
+    index = ""
     # A name may begin with a bracket.
-    index = rest.pop() if len(rest) > 1 and rest[-1].startswith("[") else ""
-    return path, "".join(rest), index
+    if len(rest) > 1 and rest[-1].startswith("["):
+        index = rest.pop()
+    return "".join(path), "".join(rest), index
 
 
 def _has_word(

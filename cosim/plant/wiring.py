@@ -192,7 +192,10 @@ class Wiring:
         plant = scenario.plant
         mapping = plant.mapping
         law = scenario.disturbance
-        codes = [mapping.law_codes[law.law]] if law.law in mapping.law_codes else []
+        # An FMU with one law has no code for it.
+        codes = []
+        if law.law in mapping.law_codes:
+            codes.append(mapping.law_codes[law.law])
         stochastic = float(law.law != "none")
         starts: list[tuple[Place, float]] = []
 
@@ -382,7 +385,8 @@ def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
     words = []
     for place in places:
         bits = 64 if place.type in WIDE_INTEGERS else 32
-        words.append((place, integer & (1 << bits) - 1))
+        lowest_bits = (1 << bits) - 1
+        words.append((place, integer & lowest_bits))
         integer >>= bits
     return words
 
@@ -399,14 +403,20 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
     """
     fmu = unpack(scenario.plant.fmu)
     wiring = Wiring(scenario, fmu)
+    # FMI 2.0 counts value references anew for each type.
     names = {}
     for name, variable in fmu.variables.items():
-        names[int(variable.valueReference), variable.type] = name
+        reference = int(variable.valueReference)
+        names[reference, variable.type] = name
     values: dict[str, tuple[str, float]] = {}
     for place, start in wiring.starts:
-        values[names[place.reference, place.type]] = (place.type, start)
+        name = names[place.reference, place.type]
+        values[name] = (place.type, start)
+    # After the starts, in which the seed's words are 0.
     for place, word in seed_words(plant_seed, wiring.seeds):
+        name = names[place.reference, place.type]
         # FMI 2.0's Integer has a sign.
-        signed = word - (1 << 32) if place.type == "Integer" and word >= 1 << 31 else word
-        values[names[place.reference, place.type]] = (place.type, signed)
+        is_negative = place.type == "Integer" and word >= 1 << 31
+        signed = word - (1 << 32) if is_negative else word
+        values[name] = (place.type, signed)
     return values

@@ -35,7 +35,7 @@ def expected_penalties_with_errors(
     """
     n = means.shape[1]
     penalties = expected_penalties(penalty, means, variances)
-    deviations = np.sqrt(variances)
+    deviations = np.sqrt(np.maximum(variances, 0.0))
     for i, seen in enumerate(errors):
         states = means[:, i, None] + deviations[:, i, None] * seen
         for row, excess in ((i, penalty.lower[i] - states), (n + i, states - penalty.upper[i])):
@@ -60,8 +60,9 @@ def expected_penalties(penalty: Penalty, means: Array, variances: Array) -> Arra
     Returns:
         Penalties of the lower, then of the upper bounds, (2n, K).
     """
-    # Zero deviation is a state that is known: the formulas hold in its limit.
-    deviations = np.maximum(np.sqrt(variances), np.finfo(np.float64).tiny)
+    # A variance of zero, or below it by rounding, is a state that is known: the limit holds.
+    least = np.finfo(np.float64).tiny
+    deviations = np.maximum(np.sqrt(np.maximum(variances, 0.0)), least)
     below = penalty.lower - means
     above = means - penalty.upper
     both = []

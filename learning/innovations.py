@@ -73,7 +73,8 @@ def fit_noise(
         value = float(away @ away) / 2 - estimator.log_likelihood
         return value, away / prior_width - sensitivities.log_likelihood
 
-    start = estimator.noise
+    # A θ file may be from far away.
+    start = np.clip(estimator.noise, prior_mean - REACH, prior_mean + REACH)
     with np.errstate(over="ignore", invalid="ignore"):  # of a filter that runs away
         result = minimize(
             loss,

@@ -57,6 +57,9 @@ def preset_sources() -> list[dict[str, bytes]]:
             for slack_weights in (False, True):
                 blocks = ThetaBlocks.from_problem(problem, slack_weights=slack_weights)
                 RtiNmpc(problem, Parameters.naive(problem, blocks)).compile(LONG)
+            # Under signals that a controller knows nothing is trained yet.
+            if problem.varying:
+                continue
             blocks = ThetaBlocks.from_problem(problem, slack_weights=True, model_parameters=names)
             Rollout(problem, Parameters.naive(problem, blocks), Features(problem))
     keep(table_sources())

@@ -46,8 +46,8 @@ INITIAL_DEVIATION = 0.1
 """Deviation of the first state from the reference, as a share of the width of its bounds."""
 UNCERTAIN = 0.1
 """Deviation of an uncertain parameter from its nominal value at the start, as a share of this."""
-DAY = 86400.0
-"""Seconds."""
+DRIFT_PERIOD = 86400.0
+"""Seconds in which an uncertain parameter changes by `parameter_drift`."""
 EXACT = 1e-6
 """Deviation of a sensor that is called exact, as a share of its variable's size: no rounding."""
 UNSEEN = 1e-8
@@ -134,7 +134,7 @@ class ExtendedKalmanFilter:
         nominal = model.nominal_parameters[self._uncertain]
         self._reference = np.concatenate([problem.reference_state, nominal])
         self._n = self._reference.size
-        share = parameter_drift * np.sqrt(problem.sampling_time / DAY)
+        share = parameter_drift * np.sqrt(problem.sampling_time / DRIFT_PERIOD)
         self._drift_variance = (share * np.abs(nominal)) ** 2
         self._initial_deviation = np.concatenate(
             [INITIAL_DEVIATION * _widths(problem), UNCERTAIN * np.abs(nominal)]

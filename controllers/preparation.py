@@ -196,7 +196,7 @@ def stage_parameter_gradient(
     tangent = ca.jtimes(x_next, point, w - point)
     lagrangian = ca.dot(chi, x_next + tangent)
     if has_prices(problem):
-        change = _priced_cost(problem, symbols, x, u)
+        change = _varying_cost(problem, symbols, x, u)
         lagrangian += change + ca.jtimes(change, point, w - point)
     if exact:
         M = ca.SX.sym("M", n + m, n + m)
@@ -258,7 +258,7 @@ def has_prices(problem: Problem) -> bool:
     return bool(of_kind(problem.varying, "price"))
 
 
-def _priced_cost(
+def _varying_cost(
     problem: Problem,
     symbols: Symbols,
     x: ca.SX,
@@ -286,7 +286,7 @@ def _curvature(
     x_next, _ = _next_state(problem, symbols, x, u)
     contracted = ca.dot(chi, x_next)
     if has_prices(problem):
-        contracted += _priced_cost(problem, symbols, x, u)
+        contracted += _varying_cost(problem, symbols, x, u)
     hessian, _ = ca.hessian(contracted, ca.vertcat(x, u))
     return hessian
 
@@ -1274,7 +1274,7 @@ def signal_costs(problem: Problem, blocks: ThetaBlocks) -> Definition:
     points = scalar_symbols({"x": (n, horizon), "u": (m, horizon)})
     references = moved_references(problem, symbols)
     x, u, at_stage = _linearisation_symbols(problem, blocks)
-    cost = _priced_cost(problem, at_stage, x, u)
+    cost = _varying_cost(problem, at_stage, x, u)
     slope = ca.gradient(cost, ca.vertcat(x, u))
     expand = ca.Function("priced", [x, u, at_stage["theta"]], [cost, slope])
 

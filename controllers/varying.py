@@ -12,7 +12,7 @@ from controllers.model import Model
 from cosim.core.scenario import Scenario, SignalTable
 from cosim.core.validation import instead
 
-Kind = Literal["disturbance", "parameter", "price", "lower", "upper", "reference"]
+VaryingKind = Literal["disturbance", "parameter", "price", "lower", "upper", "reference"]
 
 
 class Varying(NamedTuple):
@@ -26,7 +26,7 @@ class Varying(NamedTuple):
     """
 
     signal: str
-    kind: Kind
+    kind: VaryingKind
     place: int
     nominal: float
 
@@ -71,7 +71,7 @@ def _of_model(table: SignalTable, name: str, model: Model) -> Varying:
         return Varying(table.name, "disturbance", index, model.disturbances[index].nominal)
     if name in parameters:
         index = parameters.index(name)
-        kind: Kind = "price" if _is_price(model, index) else "parameter"
+        kind: VaryingKind = "price" if _is_price(model, index) else "parameter"
         return Varying(table.name, kind, index, model.parameters[index].nominal)
     raise ModelError(
         f"signal '{table.name}': model '{model.name}' has no disturbance or parameter '{name}'"
@@ -88,7 +88,7 @@ def _is_price(model: Model, index: int) -> bool:
     return bool(in_cost and not in_dynamics)
 
 
-def of_kind(varying: Iterable[Varying], *kinds: Kind) -> list[tuple[int, Varying]]:
+def of_kind(varying: Iterable[Varying], *kinds: VaryingKind) -> list[tuple[int, Varying]]:
     """The quantities of some kinds, each with its row among all.
 
     Args:

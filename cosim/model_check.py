@@ -24,7 +24,7 @@ from cosim.plant.probe import OutputKind, probe
 from cosim.plant.starts import start_parameters
 from fmus.states import continuous_states
 
-AGREES = 1e-3
+AGREEMENT = 1e-3
 """Largest difference, as a share of what the quantity varies, at which FMU and model agree."""
 SHARE_OF_START = 0.2
 """Half width of the points about a start value, as a share of it, where no bounds are given."""
@@ -34,7 +34,7 @@ MOST_SUBSTEPS = 8192
 
 
 @dataclass(frozen=True)
-class Difference:
+class ModelDifference:
     """The largest difference between FMU and model in one quantity.
 
     Attributes:
@@ -80,7 +80,7 @@ class ModelCheck:
     agrees: bool
     tolerance: float
     points: int
-    differences: tuple[Difference, ...]
+    differences: tuple[ModelDifference, ...]
     remarks: tuple[str, ...]
 
     @property
@@ -107,7 +107,7 @@ def check_model(
     sampling_time: float | None = None,
     points: int = 100,
     seed: int = 0,
-    tolerance: float = AGREES,
+    tolerance: float = AGREEMENT,
 ) -> ModelCheck:
     """Compare an FMU with a model over one sample from random points. This runs its native code.
 
@@ -387,7 +387,7 @@ def _differences(
     model: Model,
     samples: _Samples,
     kinds: Mapping[str, OutputKind],
-) -> list[Difference]:
+) -> list[ModelDifference]:
     """The largest difference in each state, in the cost and in each output."""
     plant = task.plant
     count = len(samples.x)
@@ -410,15 +410,15 @@ def _differences(
         movement = float(np.abs(of_fmu - samples.x[:, i]).max())
         title = f"{name} a sample later"
         unit = archive.unit(name)
-        result.append(_compare(model, title, unit, of_fmu, next_x[i], movement, point))
+        result.append(_compare_at(model, title, unit, of_fmu, next_x[i], movement, point))
 
-    def compare_output(name: str, function: ca.Function, of_fmu: Array) -> Difference:
+    def compare_output(name: str, function: ca.Function, of_fmu: Array) -> ModelDifference:
         """Compare at the time to which the FMU's output belongs."""
         at_end = kinds.get(name) is OutputKind.END
         states = next_x if at_end else samples.x.T
         of_model = _evaluate(function, (states, *arguments[1:]))[0]
         spread = float(np.ptp(of_fmu))
-        return _compare(model, name, archive.unit(name), of_fmu, of_model, spread, point)
+        return _compare_at(model, name, archive.unit(name), of_fmu, of_model, spread, point)
 
     result.append(compare_output(plant.stage_cost, economic_cost(model), samples.cost))
     symbols = model.symbols()
@@ -429,7 +429,7 @@ def _differences(
     return result
 
 
-def _compare(
+def _compare_at(
     model: Model,
     name: str,
     unit: str,
@@ -437,7 +437,7 @@ def _compare(
     of_model: Array,
     scale: float,
     point: Mapping[str, Array],
-) -> Difference:
+) -> ModelDifference:
     """The largest difference in a quantity, and where it is.
 
     Args:
@@ -466,7 +466,9 @@ def _compare(
     if reference:
         share = gap / reference
     where = {key: float(values[worst]) for key, values in point.items()}
-    return Difference(name, unit, gap, share, float(of_fmu[worst]), float(of_model[worst]), where)
+    return ModelDifference(
+        name, unit, gap, share, float(of_fmu[worst]), float(of_model[worst]), where
+    )
 
 
 def _evaluate(function: ca.Function, arguments: tuple[Array, ...]) -> Array:

@@ -34,7 +34,7 @@ def expected_penalties_with_errors(
         Penalties of the lower, then of the upper bounds, (2n, K).
     """
     n = means.shape[1]
-    penalties = expected_penalties(penalty, means, variances)
+    penalties = normal_penalties(penalty, means, variances)
     deviations = np.sqrt(np.maximum(variances, 0.0))
     for i, seen in enumerate(errors):
         states = means[:, i, None] + deviations[:, i, None] * seen
@@ -46,7 +46,7 @@ def expected_penalties_with_errors(
     return penalties
 
 
-def expected_penalties(penalty: Penalty, means: Array, variances: Array) -> Array:
+def normal_penalties(penalty: Penalty, means: Array, variances: Array) -> Array:
     """E[b v + B v²] of each bound, the state normal about its estimate.
 
     With z = (x_l − μ)/σ the violation of a lower bound has E[v] = σ(zΦ(z) + φ(z)) and

@@ -20,7 +20,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
 from learning.errors import PrivilegeError
 from learning.exploration import Strategy
-from learning.gaussian_penalty import expected_penalties
+from learning.gaussian_penalty import normal_penalties
 from learning.retreat import Retreat
 from learning.step import update_without_fit
 
@@ -146,7 +146,7 @@ class TrainingLoop:
         if self._loop.y is None or covariance is None:
             return self._penalty(s.tolist())
         variances = covariance.diagonal()
-        return float(expected_penalties(self._penalty, s[None], variances[None]).sum())
+        return float(normal_penalties(self._penalty, s[None], variances[None]).sum())
 
     @property
     def parameters(self) -> Parameters:

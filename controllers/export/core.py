@@ -19,7 +19,7 @@ from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions
 from controllers.problem import Problem
 from controllers.stage_symbols import given_size
 from controllers.theta import Parameters
-from controllers.varying import Kind, of_kind
+from controllers.varying import VaryingKind, of_kind
 from cosim.core.protocols import Vector
 from cosim.core.scenario import Scenario
 
@@ -236,7 +236,7 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
     }
     if isinstance(rule, Exact):
         arrays["METRIC"] = rule.metric.reshape(-1)
-    arrays |= _moving_bounds(problem)
+    arrays |= _moving_bound_rows(problem)
     arrays["DISCOUNTS"] = problem.discounts[:-1]
     arrays["SLACK_DISCOUNTS"] = problem.discounts[1:]
     array_lines = [_array_text(name, values) for name, values in arrays.items()]
@@ -257,10 +257,10 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
     )
 
 
-def _moving_bounds(problem: Problem) -> dict[str, Vector]:
+def _moving_bound_rows(problem: Problem) -> dict[str, Vector]:
     """For each state the row of the signal that is its bound, −1 without one, and its nominal."""
     arrays = {}
-    kinds: tuple[Kind, ...] = ("lower", "upper")
+    kinds: tuple[VaryingKind, ...] = ("lower", "upper")
     for kind in kinds:
         rows = np.full(problem.n_states, -1.0)
         nominal = np.zeros(problem.n_states)

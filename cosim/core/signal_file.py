@@ -6,7 +6,7 @@ import csv
 from math import isfinite
 from pathlib import Path
 
-TIME = "time"
+TIME_COLUMN = "time"
 """Column of the times in s, where a file has one."""
 
 
@@ -37,13 +37,13 @@ def read_signal_file(path: str, name: str) -> dict[str, list[float]]:
     if name not in titles:
         known = ", ".join(titles) or "nothing"
         raise ValueError(f"signal '{name}': file '{path}' has no column '{name}'; it has {known}")
-    content = {"values": _column(rows, titles, name, path)}
-    if TIME in titles and name != TIME:
-        content["times"] = _column(rows, titles, TIME, path)
+    content = {"values": _column_of(rows, titles, name, path)}
+    if TIME_COLUMN in titles and name != TIME_COLUMN:
+        content["times"] = _column_of(rows, titles, TIME_COLUMN, path)
     return content
 
 
-def _column(
+def _column_of(
     rows: list[list[str]],
     titles: list[str],
     title: str,

@@ -15,7 +15,7 @@ from cosim.core.scenario import Penalty, Scenario, SignalTable
 
 Known = Mapping[str, Array]
 """Values of each signal that is known, by its name: the present one, and those of a preview."""
-STREAM = 0x464F5245
+FORECAST_STREAM = 0x464F5245
 """Word of the key that keeps the forecasts' errors apart from every other use of a seed."""
 ROUNDING = 1e-6
 """Share of a sample by which a value may begin late: k·h and its time are rounded."""
@@ -96,7 +96,7 @@ class Signals:
             ahead = _ahead(table, scenario)
             known = np.lib.stride_tricks.sliding_window_view(values, ahead + 1)[:samples].copy()
             # Errors add up sample by sample; a function of seed, signal, and sample alone.
-            key = np.array([seed, STREAM], dtype=np.uint64)
+            key = np.array([seed, FORECAST_STREAM], dtype=np.uint64)
             counter = np.array([0, 0, 0, number], dtype=np.uint64)
             generator = np.random.Generator(np.random.Philox(key=key, counter=counter))
             draws = generator.standard_normal((samples, ahead))

@@ -89,7 +89,7 @@ def simulate(
     if signals is not None:
         signals.require(steps)
         signals.foresee(plant, spawn_seeds(seed)[0], steps)
-    _compile(controller, steps)
+    _compile_for(controller, steps)
     # The columns are there before the recorder opens its file: they may not fit the memory.
     run = _Run(plant, controller, steps, seed, residuals, signals)
     if recorder is not None:
@@ -118,7 +118,7 @@ def simulate(
     return trajectory
 
 
-def _compile(controller: Controller, steps: int) -> None:
+def _compile_for(controller: Controller, steps: int) -> None:
     """Compile an interpreted NMPC, behind an estimator too, if the run is long enough for it."""
     nmpc: Any = getattr(controller, "controller", controller)
     if functions_of(nmpc) == "interpreted" and hasattr(type(nmpc), "compile"):

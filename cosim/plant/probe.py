@@ -889,7 +889,7 @@ def probe(
         for name in subject.names[2]:
             if not has_start(fmu.variable(name)) and f"{name}_start" not in fmu.variables:
                 starts_anywhere = False
-    return _report(probe_of(subject), starts_anywhere)
+    return _as_report(probe_of(subject), starts_anywhere)
 
 
 def _undriven_inputs(subject: Subject) -> dict[str, str]:
@@ -904,7 +904,7 @@ def _undriven_inputs(subject: Subject) -> dict[str, str]:
     return undriven
 
 
-def _report(seen: Probe, starts_anywhere: bool) -> ProbeReport:
+def _as_report(seen: Probe, starts_anywhere: bool) -> ProbeReport:
     subject = seen.subject
     findings = seen.findings
     fmu = subject.fmu

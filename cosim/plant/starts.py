@@ -45,7 +45,7 @@ def start_parameters(scenario: Scenario, fmu: UnpackedFmu) -> dict[str, str]:
             # One that sets another state's start already.
             if candidate in parameters.values():
                 continue
-            value = _moved(fmu, state, candidate, initial[state])
+            value = _start_that_moves(fmu, state, candidate, initial[state])
             if _starts_at(scenario, fmu, {state: candidate}, {state: value}):
                 parameters[state] = candidate
                 values[state] = value
@@ -209,7 +209,7 @@ def _move(
     return PROBED * max(abs(value), abs(nominal), 1e-3)
 
 
-def _moved(
+def _start_that_moves(
     fmu: UnpackedFmu,
     state: str,
     parameter: str,

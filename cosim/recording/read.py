@@ -20,9 +20,9 @@ from rerun.error_utils import RerunWarning
 from cosim.core.errors import RecordingError
 from cosim.core.scenario import VIOLATING
 
-TIME = "time"
+TIMELINE = "time"
 SAMPLE = "sample"
-STATUS = "/solver/status"
+STATUS_ENTITY = "/solver/status"
 SIGNAL = "cosim.Signal"
 """Archetype of the static mark (name, unit) on every entity that holds a signal."""
 _NAMES = f"{SIGNAL}:name"
@@ -89,7 +89,7 @@ def read_recording(path: str | Path) -> Recording:
         if len(rows) > len(samples):
             samples = np.asarray(rows[SAMPLE])
             time = moments
-    changes = rows_of.get(STATUS)
+    changes = rows_of.get(STATUS_ENTITY)
     return Recording(
         # Entities come in the order in which the file's chunks were written.
         signals=dict(sorted(signals.items())),
@@ -112,7 +112,7 @@ def _entities(path: Path) -> tuple[dict[str, dict[str, list[str]]], dict[str, pa
         entity = chunk.entity_path
         if chunk.is_static:
             for column in columns:
-                static[entity][column] = _texts(batch.column(column))
+                static[entity][column] = _status_texts(batch.column(column))
         elif SAMPLE in columns:
             batches[entity].append(batch)
     rows_of = {entity: _stacked_rows(parts) for entity, parts in batches.items()}
@@ -194,7 +194,7 @@ def _chunks(path: Path) -> list[Chunk]:
         ) from None
 
 
-def _texts(column: pa.Array) -> list[str]:
+def _status_texts(column: pa.Array) -> list[str]:
     """Values of a static column, as text."""
     # A static column has one row: a value, or a list of them.
     value: Any = column[0].as_py()
@@ -226,9 +226,9 @@ def _values(rows: pa.Table, n_signals: int) -> list[NDArray[np.float64]]:
 
 def _time(rows: pa.Table) -> NDArray[np.float64]:
     """Time of the rows in s, (K,), NaN of a training, which has none."""
-    if TIME not in rows.schema.names:
+    if TIMELINE not in rows.schema.names:
         return np.full(len(rows), np.nan)
-    nanoseconds = rows[TIME].cast(pa.int64())
+    nanoseconds = rows[TIMELINE].cast(pa.int64())
     return np.asarray(nanoseconds) / 1e9
 
 

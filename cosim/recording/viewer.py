@@ -18,7 +18,7 @@ from rerun.experimental import ViewerClient
 from cosim.core.errors import RecordingError
 from cosim.core.files import replacing
 from cosim.core.processes import child_process
-from cosim.recording.read import SAMPLE, TIME, existing, worst_moment
+from cosim.recording.read import SAMPLE, TIMELINE, existing, worst_moment
 
 LOOPBACK = "127.0.0.1"
 # The port "discard", at which nothing listens.
@@ -88,8 +88,8 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
             timelines = set()
             for recording in recordings:
                 timelines |= {line.name for line in recording.timelines}
-            if at is not None and TIME in timelines:
-                client.set_time(TIME, duration=at, play_state="paused")
+            if at is not None and TIMELINE in timelines:
+                client.set_time(TIMELINE, duration=at, play_state="paused")
             elif at is not None:
                 client.set_time(SAMPLE, sequence=round(at), play_state="paused")
             picture = client.take_screenshot()

@@ -29,7 +29,7 @@ from cosim.core.protocols import Array, Controller
 from cosim.core.result import markdown_table
 from cosim.core.scenario import Scenario
 from cosim.core.trajectory import SIGNALS, RunSignals, SignalKind
-from cosim.recording.read import SAMPLE, SIGNAL, TIME
+from cosim.recording.read import SAMPLE, SIGNAL, TIMELINE
 
 if TYPE_CHECKING:
     from learning.training import Training
@@ -46,7 +46,7 @@ _WRITE_SECONDS = 30.0
 _ABANDONED: list[rr.RecordingStream] = []
 
 AT = rr.TimeRangeBoundary.absolute
-Range = tuple[float, float]
+Interval = tuple[float, float]
 
 ALONE = ("states", "actions", "sensors", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
@@ -473,7 +473,7 @@ def _signal_difference(one: Array, other: Array) -> Array:
     return difference
 
 
-def _tabs(tabs: Mapping[str, Sequence[rrb.View]], timeline: str = TIME) -> rrb.Blueprint:
+def _tabs(tabs: Mapping[str, Sequence[rrb.View]], timeline: str = TIMELINE) -> rrb.Blueprint:
     """A tab for each title with its views in a grid, where it has any, and the page about it."""
     grids = []
     for name, views in tabs.items():
@@ -547,12 +547,12 @@ class Channel:
     name: str
     unit: str = ""
     color: str = SERIES[0]
-    bounds: Range = FREE
+    bounds: Interval = FREE
     labels: Sequence[str] = ()
     step: bool = False
     points: bool = False
     tail: float = 0.0
-    seen: Range = (inf, -inf)
+    seen: Interval = (inf, -inf)
 
     @property
     def title(self) -> str:
@@ -577,7 +577,7 @@ class Channel:
         low, high = self.seen
         self.seen = (min(low, float(bottom)), max(high, float(top)))
 
-    def window(self) -> Range | None:
+    def window(self) -> Interval | None:
         """Range of view: the values seen and each bound within their span; None before any."""
         low, high = self.seen
         if low > high:
@@ -804,7 +804,7 @@ def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> lis
     if time is None:
         return [by_sample]
     nanoseconds = np.rint(time * 1e9).astype("timedelta64[ns]")
-    by_time = rr.TimeColumn(TIME, duration=nanoseconds)
+    by_time = rr.TimeColumn(TIMELINE, duration=nanoseconds)
     return [by_sample, by_time]
 
 
@@ -852,7 +852,7 @@ def view(
     )
 
 
-def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
+def layout(root: rrb.Container, timeline: str = TIMELINE) -> rrb.Blueprint:
     """The layout of a recording, with no other panels in the way.
 
     Args:

@@ -18,7 +18,7 @@ from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario, resolved
 from cosim.core.training_options import HELD_OUT, LOG, OPTION_NAMES, PARAMETERS, TrainingOptions
 from cosim.core.validation import instead, validated
-from cosim.evaluation import EVALUATION
+from cosim.evaluation import EVALUATION, NAIVE
 from cosim.identity import code_hash, versions
 from cosim.measurement import Noise
 from cosim.plant import FmuPlant
@@ -30,7 +30,6 @@ from learning.errors import ConfigurationError
 
 BASELINES = "baselines"
 """Group of the cases that figures show as lines to compare with."""
-NAIVE = "naive"
 TRAJECTORIES = "trajectories"
 """Folder of the trajectories that a study keeps of its runs."""
 LOGS = "logs"

@@ -120,10 +120,10 @@ def _summary_cells(row: Mapping[str, Any]) -> dict[str, str]:
         "regret": _percent(row, "regret_median", interval="regret_shown"),
         "worst": _percent(row, "regret_worst"),
         "iqm": _percent(row, "regret_iqm"),
-        "J": _number(row["J_median"]),
-        "J-worst": _number(row["J_worst"]),
+        "J": _shown_number(row["J_median"]),
+        "J-worst": _shown_number(row["J_worst"]),
         "gap": _percent(row, "gap_closed_median", digits=4),
-        "economic": _number(row["economic_cost"]),
+        "economic": _shown_number(row["economic_cost"]),
         "violation": f"{row['mean_violation']:.5f}",
         "violating": f"{100 * row['violating_share']:.2f}",
         "week": _estimate(row, "violations_week"),
@@ -188,7 +188,7 @@ def runs_table(study: StudyMeasurements) -> TitledRows:
                 row["status"],
                 str(row["plant_samples"] or ""),
                 _percent(row, "regret"),
-                _number(row["J"]),
+                _shown_number(row["J"]),
             ]
         )
     return header, rows
@@ -247,7 +247,7 @@ def _gains_over_baselines(
     # Of an even number the lower one of both middle runs.
     median_run = by_cost[(len(cost) - 1) // 2]
     ratio = tuned["J"].mean() / naive["J"].mean()
-    cells = [f"{ratio:.3f}", _number(cost[median_run])]
+    cells = [f"{ratio:.3f}", _shown_number(cost[median_run])]
     agrees = []
     for name in ("J", "economic_cost"):
         values = indicators[name][median_run]
@@ -291,5 +291,5 @@ def _estimate(
     return shown(value, ends, scale, digits)
 
 
-def _number(value: float) -> str:
+def _shown_number(value: float) -> str:
     return shown(float(value), digits=6)

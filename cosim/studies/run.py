@@ -79,7 +79,7 @@ TYPES: dict[str, Any] = {
     "seed": "uint64",
 }
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
-ITEM_SAMPLES = 20_000
+SAMPLES_OF_ITEM = 20_000
 """Samples of an item of an evaluation, about: some seconds where nothing is compiled."""
 PAUSE = 20
 """Least time between two writes of the tables, in multiples of the time that one takes."""
@@ -529,7 +529,7 @@ class RunStore:
             self.done += noise.samples - missing.samples
             if not missing.seeds:
                 continue
-            seeds_of_an_item = max(1, ITEM_SAMPLES // noise.length)
+            seeds_of_an_item = max(1, SAMPLES_OF_ITEM // noise.length)
             evaluation = self._evaluation(file, missing)
             for part in evaluation.parts(seeds_of_an_item):
                 yield file, part

@@ -12,9 +12,9 @@ from typing import Any
 import pandas as pd
 
 from cosim.core.training_options import LOG
-from cosim.evaluation import EVALUATION, TIMING
+from cosim.evaluation import EVALUATION, NAIVE, TIMING
 from cosim.studies.operation import OPERATION_METRICS
-from cosim.studies.plan import NAIVE, Case, Study, StudyPlan
+from cosim.studies.plan import Case, Study, StudyPlan
 from cosim.studies.run import GREEDY, INDICATORS, RunStore, read_table, typed
 
 ABOUT = "study.json"

@@ -12,7 +12,7 @@ from cosim.core.scenario import Penalty
 from cosim.core.sensors import Sensors
 from learning import train
 from learning.errors import ConfigurationError
-from learning.gaussian_penalty import expected_penalties, expected_penalties_with_errors
+from learning.gaussian_penalty import expected_penalties_with_errors, normal_penalties
 from learning.innovations import fit_noise
 from learning.log import to_csv
 from learning.training import run_training
@@ -26,7 +26,7 @@ def test_the_expected_penalty_is_the_integral(mean):
     """Independent: numerical integration of penalty times density."""
     penalty = Penalty([0.0], [1.0], [50.0], [7.0])
     deviation = 0.8
-    ours = expected_penalties(penalty, np.array([[mean]]), np.array([[deviation**2]]))
+    ours = normal_penalties(penalty, np.array([[mean]]), np.array([[deviation**2]]))
 
     def integrand(x):
         return penalty([x]) * norm.pdf(x, mean, deviation)
@@ -40,7 +40,7 @@ def test_the_expected_penalty_is_the_integral(mean):
 def test_the_expected_penalty_of_a_known_state_is_its_penalty():
     penalty = Penalty([0.0, 0.0], [1.0, 1.0], [50.0, 3.0], [7.0, 2.0])
     states = np.array([[-0.5, 0.5], [0.2, 1.7], [0.1, 0.9]])
-    ours = expected_penalties(penalty, states, np.zeros_like(states))
+    ours = normal_penalties(penalty, states, np.zeros_like(states))
     assert np.allclose(ours.sum(axis=0), penalty.along(states), rtol=1e-12)
 
 
@@ -49,7 +49,7 @@ def test_errors_that_were_seen_count_beside_the_normal_law():
     penalty = Penalty([0.0], [1.0], [50.0], [7.0])
     means = np.array([[0.3], [1.4]])
     variances = np.full((2, 1), 0.5)
-    normal = expected_penalties(penalty, means, variances)
+    normal = normal_penalties(penalty, means, variances)
     draws = norm.ppf((np.arange(20000) + 0.5) / 20000)
     both = expected_penalties_with_errors(penalty, means, variances, [draws], 1e-3)
     assert np.allclose(both, normal, rtol=1e-3)

@@ -67,12 +67,14 @@ class ActionSlopes(NamedTuple):
 
     Attributes:
         following: f(s, a), (K, n).
+        cost: ℓ(s, a), (K,).
         gain: ∂f/∂a, (K, n, m).
         cost_gradient: ∂ℓ/∂a, (K, m).
         cost_hessian: ∂²ℓ/∂a², (K, m, m).
     """
 
     following: Matrix
+    cost: Vector
     gain: Matrix
     cost_gradient: Matrix
     cost_hessian: Matrix
@@ -208,17 +210,19 @@ class ActorCritic(Algorithm):
         states = batch["s"]
         deviation = self._deviation()
         at_policy = self._model(states, batch["policy"])
-        following, prediction_errors = self._predict(at_policy.following)
+        following, prediction_errors, cost_surprise = self._predict(at_policy.following)
 
-        # The critic: the cost of the policy's action, and what is expected after it.
+        # The critic: the cost of the policy's action, and what is expected after it. That cost is
+        # the model's: a disturbance that lasts shifts realised costs and states together, which a
+        # fit would take for a slope of the value in the state.
         errors = self._errors.values
         penalty = ExpectedPenalty(self.scenario.state_penalty, errors)
-        cost_of_exploring = np.einsum("km,km->k", at_policy.cost_gradient, deviation)
-        greedy_cost = batch["cost"] - cost_of_exploring
-        reward = greedy_cost + penalty.value(following)
-        if not np.isfinite(reward).all():
+        reward = at_policy.cost + penalty.value(following)
+        if not np.isfinite(reward + cost_surprise).all():
             raise DivergenceError("the costs or the predictions are not finite")
         td_errors = self._critic.fit(states, following, errors, reward)
+        # Realised costs speak in the advantage, which only samples that explore inform.
+        td_errors = td_errors + cost_surprise - cost_surprise.mean()
 
         # The chain rule through the policy: ∇J = E[∇π ∇_a Q] (paper.tex, eq. pg_update).
         mean_error = errors.mean(axis=0)
@@ -271,15 +275,16 @@ class ActorCritic(Algorithm):
             in_state=in_state,
         )
 
-    def _predict(self, at_policy: Matrix) -> tuple[Matrix, Matrix]:
+    def _predict(self, at_policy: Matrix) -> tuple[Matrix, Matrix, Vector]:
         """Take in the batch's prediction errors.
 
         Args:
             at_policy: next states of the nominal model under the policy, (K, n).
 
         Returns:
-            The predictions of the next states under the policy, and the errors that are left of the
-            predictions at the actions that were applied, (K, n).
+            The predictions of the next states under the policy (K, n), the errors that are left of
+            the predictions at the actions that were applied (K, n), and by how much those samples
+            cost more than the model says (K,).
         """
         states = self._batch["s"]
         applied = self._model(states, self._batch["a"])
@@ -294,7 +299,7 @@ class ActorCritic(Algorithm):
             errors = errors - systematic
         for error in errors:
             self._errors.add(error)
-        return following, errors
+        return following, errors, self._batch["cost"] - applied.cost
 
     def _begin(self, states: Matrix, errors: Matrix) -> None:
         """Take the coordinates from the first batch: deviations of θ that have no unit."""
@@ -411,16 +416,17 @@ class NominalModel:
         gain = ca.jacobian(following, u)
         cost = economic_cost(model)(x, u, d, p)
         hessian, gradient = ca.hessian(cost, u)
-        results = [following, gain, gradient, hessian]
+        results = [following, cost, gain, gradient, hessian]
         self._function = ca.Function("slopes", [x, u], results)
 
     def __call__(self, states: Matrix, actions: Matrix) -> ActionSlopes:
         """The model at states (K, n) and actions (K, m)."""
         # CasADi takes a sample a column, and puts the samples' matrices beside each other.
-        following, gain, gradient, hessian = self._function(states.T, actions.T)
+        following, cost, gain, gradient, hessian = self._function(states.T, actions.T)
         count = len(states)
         return ActionSlopes(
             following=following.full().T,
+            cost=cost.full().reshape(-1),
             gain=_by_sample(gain, count),
             cost_gradient=gradient.full().T,
             cost_hessian=_by_sample(hessian, count),
@@ -542,6 +548,11 @@ class DifferentialValue:
         self.weights = weights.astype(np.float64)
         td_errors: Vector = reward - change @ self.weights
         return td_errors
+
+    @property
+    def n_samples(self) -> float:
+        """Samples that count, those that are partly forgotten by their share."""
+        return float(self._matrix[0, 0])
 
     def forget(self, share: float) -> None:
         """Let what has been taken in so far count by this share."""

@@ -27,6 +27,7 @@ from learning.configuration import (
     ExplorationShare,
 )
 from learning.errors import DivergenceError
+from learning.persistence import effective_number, estimated
 from learning.prediction_errors import OneStepModel, PredictionErrors
 from learning.step import ConstrainedStep, Fit, td_fit, td_step
 
@@ -34,6 +35,10 @@ Values = TypeVar("Values", float, NDArray[np.float64])
 
 LEAST_MEAN_SAMPLES = 10
 """Samples of the shortest mean of ∇Q: over M samples it takes 1/M of what each of them teaches."""
+PERSISTENCE_DOUBT = 4.0
+"""Standard deviations by which errors must look correlated in time before they count as that."""
+LEAST_ERRORS = 50
+"""Errors that say something of their correlation, at least."""
 
 
 class ValueConfiguration(Configuration):
@@ -433,6 +438,7 @@ class QLearning(ValueRule):
         start = self._begin_with_prior(states, errors, deviation)
         least_variance = np.finfo(np.float64).tiny
         self._regression = self._new_regression(max(variance, least_variance))
+        self._regression.redundancy = redundancy_of(errors)
         return self._step.move(start.theta, deviation)
 
     def _new_regression(self, variance: float) -> KalmanRegression:
@@ -489,6 +495,25 @@ class QLearning(ValueRule):
         self._sum_of_squares = state["sum_of_squares"]
 
 
+def redundancy_of(errors: Matrix) -> float:
+    """Consecutive samples that say as much as one independent sample, by the prediction errors.
+
+    A disturbance with a memory makes errors, and with them TD errors, that are correlated in time.
+
+    Args:
+        errors: e of consecutive samples, (K, n).
+
+    Returns:
+        (1 + ρ)/(1 − ρ) of their autoregression; 1 where independent errors would look like it.
+    """
+    n_errors, n = errors.shape
+    if n_errors < LEAST_ERRORS:
+        return 1.0
+    unknown = np.zeros((n, n))
+    persistence = estimated(errors[1:], errors[:-1], PERSISTENCE_DOUBT, unknown, 0)
+    return 1.0 / effective_number(persistence, 1)
+
+
 @dataclass
 class KalmanRegression:
     """d ~ N(0, I) in scaled coordinates; each δ measures ∇Qᵀd with variance r.
@@ -505,6 +530,8 @@ class KalmanRegression:
         drift: added to P's diagonal at each sample.
         largest: a step has no entry beyond ±largest.
         outlier: squares of innovations beyond this many r count as this many.
+        redundancy: consecutive samples that say as much as one independent sample; the noise of
+            a sample counts as r times this.
     """
 
     size: int
@@ -514,6 +541,7 @@ class KalmanRegression:
     drift: float = 0.0
     largest: float = np.inf
     outlier: float = 25.0
+    redundancy: float = 1.0
 
     def __post_init__(self) -> None:
         self.mean: Vector = np.zeros(self.size)
@@ -533,7 +561,9 @@ class KalmanRegression:
         """
         # The Kalman recursion for one scalar measurement.
         spread = self.covariance @ gradient
-        scale = self.variance + float(gradient @ spread)
+        # Noise that lasts tells the same again: the filter takes each sample for less.
+        noise = self.redundancy * self.variance
+        scale = noise + float(gradient @ spread)
         innovation = td_error - float(gradient @ self.mean)
         # A rare spike of the cost must not move θ as far as a hundred samples do.
         limit = self.clip * self.variance**0.5
@@ -578,6 +608,7 @@ class KalmanRegression:
             "covariance": self.covariance,
             "covariance_at_step": self.covariance_at_step,
             "variance": self.variance,
+            "redundancy": self.redundancy,
         }
 
     def load_state_dict(self, state: State) -> None:
@@ -586,6 +617,7 @@ class KalmanRegression:
         self.covariance = state["covariance"]
         self.covariance_at_step = state["covariance_at_step"]
         self.variance = state["variance"]
+        self.redundancy = state["redundancy"]
 
 
 class AverageCost:

@@ -5,7 +5,7 @@ import pytest
 
 from controllers.rti import RtiNmpc
 from learning import QLearning
-from learning.q_learning import AverageCost, KalmanRegression
+from learning.q_learning import AverageCost, KalmanRegression, redundancy_of
 from learning.step import Fit
 from learning.training_run import starting_parameters
 from tests.helpers.training import looped
@@ -69,6 +69,32 @@ def test_the_recursion_is_the_batch_ridge_regression(data):
     fit = kalman.step()
     assert fit.metric() == pytest.approx(information)
     assert fit.metric() @ fit.minimiser == pytest.approx(fit.gradient)
+
+
+def test_noise_that_lasts_counts_as_so_much_more_noise(data):
+    gradient, errors = data
+    kalman, noisier = regression(4, 0.7), regression(4, 2.1)
+    kalman.redundancy = 3.0
+    for row, error in zip(gradient, errors, strict=True):
+        kalman.update(error, row)
+        noisier.update(error, row)
+    assert kalman.mean == pytest.approx(noisier.mean)
+    assert kalman.covariance == pytest.approx(noisier.covariance)
+
+
+@pytest.mark.parametrize("memory", [0.5, 0.8, 0.9])
+def test_redundancy_is_that_of_the_mean_of_an_autoregression(rng, memory):
+    """Var of the mean of K errors is σ²/K·(1 + ρ)/(1 − ρ)."""
+    errors = np.zeros((4000, 2))
+    for k in range(1, len(errors)):
+        errors[k] = memory * errors[k - 1] + rng.normal(size=2) * [1.0, 1e-3]
+    assert redundancy_of(errors) == pytest.approx((1 + memory) / (1 - memory), rel=0.3)
+
+
+def test_independent_errors_are_not_redundant(rng):
+    for _ in range(20):
+        assert redundancy_of(rng.normal(size=(500, 2)) * [1.0, 1e-3]) == 1.0
+    assert redundancy_of(np.ones((3, 2))) == 1.0
 
 
 def test_an_outlier_moves_no_further_than_the_clip():

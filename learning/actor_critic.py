@@ -19,6 +19,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, ExplorationProbability
 from learning.errors import DivergenceError
+from learning.persistence import linear_part
 from learning.prediction_errors import PredictionErrors, SortedErrors, expected_penalties
 from learning.q_learning import ValueConfiguration, prior_deviation
 from learning.step import ConstrainedStep, Fit, policy_gradient_fit
@@ -600,17 +601,6 @@ class DifferentialValue:
         self._matrix = state["matrix"]
         self._moment = state["moment"]
         self.weights = state["weights"]
-
-
-def linear_part(states: Matrix, errors: Matrix) -> Matrix:
-    """The part of errors (K, n) that is affine in the states (K, n), by least squares, (K, n)."""
-    spread = states.std(axis=0)
-    spread = np.where(spread > 0, spread, 1.0)
-    z = (states - states.mean(axis=0)) / spread
-    features = np.hstack([_ones(z), z])
-    coefficients, *_ = np.linalg.lstsq(features, errors)
-    part: Matrix = features @ coefficients
-    return part
 
 
 def _ones(rows: Matrix) -> Matrix:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.core.protocols import Array
+from cosim.core.protocols import Array, Matrix
 
 DOUBLINGS = 12
 """Rounds of the sum Γ, 2¹² terms: at the largest radius what is left out is below rounding."""
@@ -137,3 +137,12 @@ def effective_number(persistence: Array, count: int) -> float:
     """
     radius = _radius(persistence) if persistence.any() else 0.0
     return count * (1 - radius) / (1 + radius)
+
+
+def linear_part(states: Matrix, errors: Matrix) -> Matrix:
+    """The part of errors (K, n) that is affine in the states (K, n), by least squares, (K, n)."""
+    spread = states.std(axis=0)
+    z = (states - states.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    features = np.hstack([np.ones((len(z), 1)), z])
+    part: Matrix = features @ np.linalg.lstsq(features, errors)[0]
+    return part

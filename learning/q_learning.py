@@ -27,7 +27,7 @@ from learning.configuration import (
     ExplorationShare,
 )
 from learning.errors import DivergenceError
-from learning.persistence import effective_number, estimated
+from learning.persistence import effective_number, estimate_persistence, linear_part
 from learning.prediction_errors import OneStepModel, PredictionErrors
 from learning.step import ConstrainedStep, Fit, td_fit, td_step
 
@@ -438,7 +438,7 @@ class QLearning(ValueRule):
         start = self._begin_with_prior(states, errors, deviation)
         least_variance = np.finfo(np.float64).tiny
         self._regression = self._new_regression(max(variance, least_variance))
-        self._regression.redundancy = redundancy_of(errors)
+        self._regression.redundancy = redundancy_of(states, errors)
         return self._step.move(start.theta, deviation)
 
     def _new_regression(self, variance: float) -> KalmanRegression:
@@ -495,13 +495,15 @@ class QLearning(ValueRule):
         self._sum_of_squares = state["sum_of_squares"]
 
 
-def redundancy_of(errors: Matrix) -> float:
+def redundancy_of(states: Matrix, errors: Matrix) -> float:
     """Consecutive samples that say as much as one independent sample, by the prediction errors.
 
     A disturbance with a memory makes errors, and with them TD errors, that are correlated in time.
+    Errors that follow the state are those of a wrong model, which θ may correct: they do not count.
 
     Args:
-        errors: e of consecutive samples, (K, n).
+        states: s of consecutive samples, (K, n).
+        errors: their prediction errors e, (K, n).
 
     Returns:
         (1 + ρ)/(1 − ρ) of their autoregression; 1 where independent errors would look like it.
@@ -509,8 +511,11 @@ def redundancy_of(errors: Matrix) -> float:
     n_errors, n = errors.shape
     if n_errors < LEAST_ERRORS:
         return 1.0
+    left = errors - linear_part(states, errors)
     unknown = np.zeros((n, n))
-    persistence = estimated(errors[1:], errors[:-1], PERSISTENCE_DOUBT, unknown, 0)
+    persistence = estimate_persistence(
+        left[1:], left[:-1], unknown, n_earlier=0, doubt=PERSISTENCE_DOUBT
+    )
     return 1.0 / effective_number(persistence, 1)
 
 

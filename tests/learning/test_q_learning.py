@@ -88,13 +88,24 @@ def test_redundancy_is_that_of_the_mean_of_an_autoregression(rng, memory):
     errors = np.zeros((4000, 2))
     for k in range(1, len(errors)):
         errors[k] = memory * errors[k - 1] + rng.normal(size=2) * [1.0, 1e-3]
-    assert redundancy_of(errors) == pytest.approx((1 + memory) / (1 - memory), rel=0.3)
+    states = rng.normal(size=errors.shape)
+    assert redundancy_of(states, errors) == pytest.approx((1 + memory) / (1 - memory), rel=0.3)
 
 
 def test_independent_errors_are_not_redundant(rng):
     for _ in range(20):
-        assert redundancy_of(rng.normal(size=(500, 2)) * [1.0, 1e-3]) == 1.0
-    assert redundancy_of(np.ones((3, 2))) == 1.0
+        states, errors = rng.normal(size=(2, 500, 2)) * [1.0, 1e-3]
+        assert redundancy_of(states, errors) == 1.0
+    assert redundancy_of(np.ones((3, 2)), np.ones((3, 2))) == 1.0
+
+
+def test_errors_of_a_wrong_model_are_not_redundant(rng):
+    """The state of a slow plant lasts, and so do errors that follow it."""
+    states = np.zeros((500, 2))
+    for k in range(1, len(states)):
+        states[k] = 0.9 * states[k - 1] + rng.normal(size=2)
+    errors = 0.5 * states + rng.normal(size=(500, 2))
+    assert redundancy_of(states, errors) == 1.0
 
 
 def test_an_outlier_moves_no_further_than_the_clip():

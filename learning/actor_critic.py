@@ -21,7 +21,7 @@ from learning.configuration import Configuration, Count, ExplorationProbability
 from learning.errors import DivergenceError
 from learning.persistence import linear_part
 from learning.prediction_errors import PredictionErrors, SortedErrors, expected_penalties
-from learning.q_learning import ValueConfiguration, prior_deviation
+from learning.q_learning import ValueConfiguration, prior_deviation, redundancy_of
 from learning.step import ConstrainedStep, Fit, policy_gradient_fit
 
 DIFFERENCE_SHARE = 0.25
@@ -43,7 +43,8 @@ class ActorCriticConfiguration(Configuration):
     )
     prediction_errors: Count = Field(
         1000,
-        description="prediction errors over which the next value is expected",
+        description="prediction errors over which the next value is expected; more where they are "
+        "correlated in time",
     )
     advantage_width: Positive = Field(
         0.1,
@@ -303,8 +304,13 @@ class ActorCritic(Algorithm):
         return following, errors, self._batch["cost"] - applied.cost
 
     def _begin(self, states: Matrix, errors: Matrix) -> None:
-        """Take the coordinates from the first batch: deviations of θ that have no unit."""
+        """Take the coordinates from the first batch: deviations of θ that have no unit.
+
+        Of errors that are correlated in time more are kept, so that they say as much of the tails.
+        """
         settings = self.configuration
+        n_errors = round(settings.prediction_errors * redundancy_of(states, errors))
+        self._errors = PredictionErrors(self.scenario, n_errors)
         start = self.controller.parameters
         deviation = prior_deviation(
             start,

@@ -109,9 +109,11 @@ class Unit:
 
     def si(self) -> dict[str, object]:
         """The attributes of FMI's BaseUnit."""
-        factor = self.factor if self.factor != 1.0 else None
-        offset = self.offset if self.offset != 0.0 else None
-        return {**(self.exponents or {}), "factor": factor, "offset": offset}
+        attributes: dict[str, object] = dict(self.exponents or {})
+        # What is None is not written: it is FMI's default.
+        attributes["factor"] = None if self.factor == 1.0 else self.factor
+        attributes["offset"] = None if self.offset == 0.0 else self.offset
+        return attributes
 
 
 _TABLE = (Path(__file__).parent / "resources" / "units.csv").read_text(encoding="utf-8")
@@ -211,8 +213,12 @@ class FmuModel:
     @cached_property
     def by_name(self) -> dict[str, Variable]:
         """Each variable by its name, an array's first element by the array's, too."""
-        firsts = {name: elements[0] for name, elements in self.arrays.items()}
-        return firsts | {variable.name: variable for variable in self.variables}
+        variables = {}
+        for name, elements in self.arrays.items():
+            variables[name] = elements[0]
+        for variable in self.variables:
+            variables[variable.name] = variable
+        return variables
 
     def value_reference(self, name: str) -> int:
         """The value reference of variable `name`; KeyError when there is none."""
@@ -555,8 +561,10 @@ def _start_and_range(most: float, variable: Variable) -> tuple[float, ...]:
     """Start, range and nominal value as the C has them; without a range it is −`most` to `most`."""
     low = -most if variable.min is None else variable.min
     high = most if variable.max is None else variable.max
+    # In C a word of the seed has 32 bits and no sign.
     if variable.type in (Type.SEED, Type.SEED_HIGH):
-        low, high = 0.0, 2.0**32 - 1
+        low = 0.0
+        high = 2.0**32 - 1
     nominal = 1.0 if variable.nominal is None else variable.nominal
     numbers = (variable.start, low, high, nominal)
     # Nothing and −0.0 are written as 0.0.

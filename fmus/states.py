@@ -16,15 +16,21 @@ def _variables(fmu: Path) -> tuple[bool, tuple[ElementTree.Element, ...]]:
             root = ElementTree.fromstring(archive.read("modelDescription.xml"))
     except (OSError, KeyError, zipfile.BadZipFile, ElementTree.ParseError):
         return False, ()
-    fmi2 = root.get("fmiVersion", "").startswith("2")
+    is_fmi2 = root.get("fmiVersion", "").startswith("2")
     table = root.find("ModelVariables")
-    return fmi2, () if table is None else tuple(table)
+    # An FMU need not have any.
+    if table is None:
+        return is_fmi2, ()
+    return is_fmi2, tuple(table)
 
 
 def _attribute(variable: ElementTree.Element, name: str, fmi2: bool) -> str:
     """An attribute of a real variable: FMI 2.0 has it at the type, a child; empty without one."""
     element = variable.find("Real") if fmi2 else variable
-    return "" if element is None else element.get(name, "")
+    # A variable of another type.
+    if element is None:
+        return ""
+    return element.get(name, "")
 
 
 def continuous_states(fmu: Path) -> tuple[str, ...]:
@@ -65,6 +71,10 @@ def time_constants(fmu: Path) -> dict[str, float]:
         name = variable.get("name", "")
         disturbance = name.removesuffix("_time_constant")
         start = _attribute(variable, "start", fmi2)
-        if disturbance != name and start and float(start) > 0.0:
-            constants[disturbance] = float(start)
+        if disturbance == name or not start:
+            continue
+        # 0 is a disturbance without memory.
+        seconds = float(start)
+        if seconds > 0.0:
+            constants[disturbance] = seconds
     return constants

@@ -422,7 +422,9 @@ class Penalty:
 
     def violation(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Violation v ≥ 0 of each bound for states (…, n), same shape and units."""
-        outside: NDArray[np.float64] = np.maximum(self.lower - states, states - self.upper)
+        below = self.lower - states
+        above = states - self.upper
+        outside: NDArray[np.float64] = np.maximum(below, above)
         return np.maximum(outside, 0.0)
 
 
@@ -807,7 +809,8 @@ class Scenario(Shown, Table):
 
     def saturate(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """Actions (…, m) clipped to the actuators' bounds."""
-        return np.minimum(np.maximum(action, self.action_lower), self.action_upper)
+        at_least = np.maximum(action, self.action_lower)
+        return np.minimum(at_least, self.action_upper)
 
 
 PRESETS = Path(__file__).parents[1] / "presets"

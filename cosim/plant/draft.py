@@ -189,7 +189,8 @@ def draft_scenario(
         )
         units = plant.units
     # A violation of one unit costs some ten times what a sample does, to a power of ten.
-    weight = 10.0 ** ceil(log10(10 * max(abs(cost), 1.0)) - 0.5)
+    ten_samples = 10 * max(abs(cost), 1.0)
+    weight = 10.0 ** ceil(log10(ten_samples) - 0.5)
     document["penalty"]["linear"] = [weight] * len(x)
     document["plant"]["initial_state"] = x.tolist()
     document["controller"] = _reference(x, u, cost)
@@ -209,7 +210,9 @@ def _known_states(fmu: str | Path) -> tuple[str, ...]:
 
     The controller's model, which a draft names for a shipped FMU, has them.
     """
-    for name in presets() if str(fmu) in SHIPPED_FMUS else ():
+    if str(fmu) not in SHIPPED_FMUS:
+        return ()
+    for name in presets():
         plant = Scenario.load(name).plant
         if plant.fmu == str(fmu):
             return plant.states
@@ -507,8 +510,9 @@ def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
     above: dict[str, list[str]] = {}
     for name, remark in remarks.items():
         place = name if name in names else name.rpartition(".")[0]
-        wrapped = textwrap.wrap(remark, 98, break_on_hyphens=False)
-        above.setdefault(place, []).extend(f"# {words}" for words in wrapped)
+        comment = above.setdefault(place, [])
+        for words in textwrap.wrap(remark, 98, break_on_hyphens=False):
+            comment.append(f"# {words}")
     lines = [HEAD, ""]
     for name, line in zip(names, text.splitlines(), strict=True):
         lines += [*above.pop(name, []), line]
@@ -604,7 +608,11 @@ def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
         table["stochastic"] = "stochastic"
     declared = getattr(known.get("law"), "declaredType", None)
     items = getattr(declared, "items", None) or []
-    codes = {item.name: int(item.value) for item in items if item.name in ("uniform", "normal")}
+    codes = {}
+    for item in items:
+        # The laws that a scenario knows.
+        if item.name in ("uniform", "normal"):
+            codes[item.name] = int(item.value)
     if codes and is_parameter("law", ("Enumeration",)):
         table["law"] = "law"
         table["law_codes"] = codes
@@ -645,8 +653,9 @@ def nearest_steady_state(
     """
     # A plant that cannot start elsewhere cannot be searched.
     if not plant.scenario.plant.mapping.initial_state:
-        state = plant.reset(0)
-        return state, action, plant.step(action).stage_cost
+        x = plant.reset(0)
+        cost = plant.step(action).stage_cost
+        return x, action, cost
     n = len(state)
     low, high = plant.state_range
     lower = np.concatenate([low, plant.scenario.action_lower])
@@ -656,8 +665,11 @@ def nearest_steady_state(
     scale: Array = np.maximum(np.abs(start), 1e-2)
 
     def residual(z: Array) -> Array:
-        plant.reset(0, z[:n])
-        return (plant.step(z[n:]).s - z[:n]) / scale[:n]
+        """How far a sample carries the states, in their scales, (n,)."""
+        x, u = z[:n], z[n:]
+        plant.reset(0, x)
+        movement = plant.step(u).s - x
+        return movement / scale[:n]
 
     precise = {"diff_step": DIFFERENCE, "gtol": 1e-15, "ftol": None, "xtol": None}
     start = np.clip(start, lower, upper)
@@ -672,5 +684,7 @@ def nearest_steady_state(
             f"still moves a state by {residual_left:.2g} of its scale); give other start "
             "values by --state and --action"
         )
-    plant.reset(0, z[:n])
-    return z[:n], z[n:], plant.step(z[n:]).stage_cost
+    x, u = z[:n], z[n:]
+    plant.reset(0, x)
+    cost = plant.step(u).stage_cost
+    return x, u, cost

@@ -518,9 +518,12 @@ class Probe:
         """Choose the inputs of the runs; real ones vary by a share of their distance."""
         low = self.subject.low
         high = list(self.subject.high)
-        for i, place in enumerate(self.subject.exchanged[0]):
+        inputs, _, _ = self.subject.exchanged
+        for i, place in enumerate(inputs):
+            # An integer has nothing between two values.
             if place.type in REALS:
-                high[i] = low[i] + share * (high[i] - low[i])
+                distance = high[i] - low[i]
+                high[i] = low[i] + share * distance
         self._low = low
         self._high = tuple(high)
         # Changes at most steps, and one input twice: an output that follows changes with it.
@@ -621,12 +624,16 @@ class Probe:
         return halves[0].states != whole or halves[1].states == whole
 
     def _misset(self, bench: _Bench) -> tuple[tuple[str, float, float], ...]:
+        """Start values that the FMU did not take: name, what was asked for, what it has."""
         present = bench.start().read_starts()
+        subject = self.subject
         rows = []
-        for i, name in enumerate(self.subject.start_names):
-            asked = self.subject.starts[i][1]
-            if not as_asked(asked, present[i]):
-                rows.append((name, asked, present[i]))
+        # The seed's words, which stand behind the named starts, are no values that one reads back.
+        for name, (_, asked), value in zip(
+            subject.start_names, subject.starts, present, strict=False
+        ):
+            if not as_asked(asked, value):
+                rows.append((name, asked, value))
         return tuple(rows)
 
     def _kinds(
@@ -685,11 +692,12 @@ class Probe:
 
         try:
             half = under(self._inputs[k], step / 2)
-            short = (under(self._low, step * SHORT_STEP), under(self._high, step * SHORT_STEP))
+            at_low = under(self._low, step * SHORT_STEP)
+            at_high = under(self._high, step * SHORT_STEP)
         except PlantError:
             bench.instantiate()
             return None
-        return Point(k, before, first.samples[k], half, short)
+        return Point(k, before, first.samples[k], half, (at_low, at_high))
 
     @cached_property
     def reading(self) -> Reading:
@@ -793,7 +801,8 @@ class Probe:
         bench.go_on(fmi, self._inputs[:1])
         states = tuple(fmi.states)
         fmi.save(bench.handle)
-        return fmi, states, bench.go_on(fmi, self._inputs[1:], first=1)
+        samples = bench.go_on(fmi, self._inputs[1:], first=1)
+        return fmi, states, samples
 
     def _try_snapshot(self, bench: _Bench) -> str:
         # What the same steps give where nothing is saved.
@@ -899,7 +908,9 @@ def _undriven_inputs(subject: Subject) -> dict[str, str]:
     for variable in subject.fmu.description.modelVariables:
         if variable.causality != "input" or variable.name in subject.names[0]:
             continue
-        if (int(variable.valueReference), str(variable.type), 0) not in places:
+        place = (int(variable.valueReference), str(variable.type), 0)
+        # A scenario's parameter drives it, at one value.
+        if place not in places:
             undriven[variable.name] = str(variable.start or "")
     return undriven
 

@@ -49,13 +49,17 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
         )
     if not measured:
         return controller
-    problem = replace(controller.problem, model=controller.problem.model.measuring(measured))
+    model = controller.problem.model.measuring(measured)
+    problem = replace(controller.problem, model=model)
     before = controller.parameters.blocks
     in_theta = before.block("p").labels if "p" in before else ()
+    # A measured disturbance is a parameter of the model, and as such an entry of θ, which the
+    # exported controller takes from an input at each sample.
     blocks = ThetaBlocks.from_problem(
         problem, slack_weights="w_sigma" in before, model_parameters=(*in_theta, *measured)
     )
-    return RtiNmpc(problem, controller.parameters.placed_in(Parameters.naive(problem, blocks)))
+    naive = Parameters.naive(problem, blocks)
+    return RtiNmpc(problem, controller.parameters.placed_in(naive))
 
 
 def sampled_controller(
@@ -69,15 +73,22 @@ def sampled_controller(
     plant = unpack(scenario.plant.fmu)
     hessian = scenario.controller.hessian
     origin = f"{scenario.hash} {hessian} {controller.parameters.hash}"
-    problem, parameters = controller.problem, controller.parameters
-    exported, blocks = core(problem, parameters, hessian), parameters.blocks
-    states, actions = scenario.plant.states, scenario.plant.actions
-    points = (*problem.reference_state.tolist(), *problem.reference_action.tolist())
-    start = dict(zip((*states, *actions), points, strict=True))
+    problem = controller.problem
+    parameters = controller.parameters
+    blocks = parameters.blocks
+    exported = core(problem, parameters, hessian)
+    states = scenario.plant.states
+    actions = scenario.plant.actions
+    # Before anything is connected the controller sees its reference.
+    reference = (*problem.reference_state.tolist(), *problem.reference_action.tolist())
+    start = dict(zip((*states, *actions), reference, strict=True))
 
-    def signal(kind: Kind, name: str, about: str, of: str, **more: Any) -> Variable:
-        return Variable(name, kind, unit=plant.unit(of), description=about, **more)
+    def signal(kind: Kind, name: str, about: str, variable: str, **more: Any) -> Variable:
+        """A signal with the unit of a variable of the plant."""
+        unit = plant.unit(variable)
+        return Variable(name, kind, unit=unit, description=about, **more)
 
+    # The order is that of the C's arrays: inputs, outputs, predictions, θ.
     signals = [signal(Kind.INPUT, x, "measured state", x, start=start[x]) for x in states]
     about = "whether the actions are those of manual_…, as of the next sample"
     signals.append(
@@ -100,20 +111,22 @@ def sampled_controller(
         "failures": "samples without a solution so far; they hold the last or manual action",
     }
     signals += [Variable(name, Kind.OUTPUT, description=text) for name, text in reports.items()]
+    # No action follows the last predicted state.
     for names, stages in ((states, problem.horizon + 1), (actions, problem.horizon)):
-        signals += [
-            signal(Kind.OUTPUT, f"predicted.{x}[{k}]", f"predicted {x}, {k} samples ahead", x)
-            for k in range(stages)
-            for x in names
-        ]
+        for k in range(stages):
+            for name in names:
+                about = f"predicted {name}, {k} samples ahead"
+                signals.append(signal(Kind.OUTPUT, f"predicted.{name}[{k}]", about, name))
     meanings = [block.meaning for block in blocks for _ in range(block.size)]
     signals += [
         Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
         for (label, value), about in zip(theta.items(), meanings, strict=True)
     ]
+    # Another controller has another name in C, so that both may be linked into one program.
+    digest = hashlib.sha256(origin.encode()).hexdigest()
     return FmuModel(
         name=f"RTI-NMPC {scenario.name}",
-        identifier=f"rti_nmpc_{hashlib.sha256(origin.encode()).hexdigest()[:12]}",
+        identifier=f"rti_nmpc_{digest[:12]}",
         description=(
             f"Real-time-iteration NMPC for {scenario.name}: horizon {problem.horizon}, "
             f"{hessian} Hessian, θ {parameters.hash}"
@@ -131,6 +144,7 @@ def write_c(
 ) -> dict[str, Any]:
     """Write the controller as C into `folder`, whose name its functions begin with."""
     exported = core(controller.problem, controller.parameters, scenario.controller.hessian)
+    # A folder's name may hold what no C identifier does.
     name = re.sub(r"\W", "_", folder.absolute().name)
     files = plain_c(exported, name, scenario, single=single)
     folder.mkdir(exist_ok=True)

@@ -52,11 +52,14 @@ def export(
         for target in [out] if ssp is None else [out, ssp]:
             if not target.parent.is_dir():
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
-            if format_ == "fmu":  # before the minutes that compilers may take
+            # Before the minutes that compilers may take.
+            if format_ == "fmu":
                 check_target(target)
         loaded = cosim.Scenario.load(scenario)
         names = tuple(dict.fromkeys(split_names(measured)))
-        if ssp is not None and (missing := set(names) - set(loaded.plant.disturbances)):
+        missing = set(names) - set(loaded.plant.disturbances)
+        # In the SSP the plant is what measures them; elsewhere the user connects them.
+        if ssp is not None and missing:
             raise CosimError(f"--ssp: the plant has no disturbance {', '.join(sorted(missing))}")
         rti = controller_fmu.rti_controller(controller, loaded, names)
         if format_ == "c":
@@ -73,7 +76,8 @@ def export(
         path = controller_fmu.write_fmu(
             rti, loaded, out, version, measured=names, every_platform=every_platform
         )
-        platforms = [p.tuple for p in (PLATFORMS if every_platform else [present()])]
+        built_for = PLATFORMS if every_platform else [present()]
+        platforms = [platform.tuple for platform in built_for]
         out_.note(f"wrote {path}: FMI {version}.0 for {', '.join(platforms)}")
         document = {
             "fmu": str(path),

@@ -38,9 +38,12 @@ def show_fmu(file: FmuFileArgument = "evaporator", json: JsonOption = False) -> 
 
         try:
             unpacked = unpack(_path(file))
-            description, refused = unpacked.description, list(refusals(unpacked))
+            description = unpacked.description
+            refused = list(refusals(unpacked))
+        # What cannot be a plant can still be looked into.
         except PlantError as error:
-            description, refused = None, [str(error)]
+            description = None
+            refused = [str(error)]
         about = information(_path(file), description)
         binaries = []
         for platform, made_for in about["platforms"].items():
@@ -200,6 +203,7 @@ def build_fmu(
         from fmus.evaporator import build_in_place, compare_with_shipped
 
         every = platforms == "all"
+        # None of them is a default: two of three would replace files.
         if (out is not None) + check + in_place != 1:
             raise BuildError("give one of --out DIR, --check and --in-place")
         if folder is not None and (out is None or out.suffix != ".fmu"):

@@ -166,6 +166,8 @@ for panel, group, name, *examples in (
         command.help = _help_text(command.callback)
         command.epilog = text
 
+# 2 is what Typer exits with on a wrong option, 70 sysexits' EX_SOFTWARE; a process that a signal
+# ends has 128 + the signal's number in a shell.
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70
 EXIT_INTERRUPTED = 130
@@ -174,6 +176,7 @@ EXIT_TERMINATED = 143
 
 
 def _version(wanted: bool) -> None:
+    # Typer calls it without the option, too.
     if not wanted:
         return
     import hashlib
@@ -253,14 +256,17 @@ def _run_app() -> None:
     """Run the application; any exception ends in its line and exit code."""
     try:
         app()
+    # A command's own exit code: 1 says that the answer is no, as of `diff`.
     except SystemExit:
         raise
     except (Interrupted, Terminated) as error:
         unwound.set()
-        stopped = isinstance(error, Interrupted)
-        notes = error.args if stopped else getattr(error, "__notes__", ())
-        print("; ".join(["interrupted" if stopped else "terminated", *notes]), file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED if stopped else EXIT_TERMINATED)
+        # The notes say how to go on (`cosim.cli.output.resumable`).
+        if isinstance(error, Interrupted):
+            print("; ".join(["interrupted", *error.args]), file=sys.stderr)
+            sys.exit(EXIT_INTERRUPTED)
+        print("; ".join(["terminated", *getattr(error, "__notes__", ())]), file=sys.stderr)
+        sys.exit(EXIT_TERMINATED)
     except BaseException as error:
         # Libraries raise other errors over it, and the cross compiler has its own word for it.
         if re.search("Too many open files|FdQuota", "".join(traceback.format_exception(error))):
@@ -279,7 +285,9 @@ def _run_app() -> None:
 
 
 def _fail(message: str) -> None:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    # A message of a library may have several lines.
+    one_line = " ".join(message.split())
+    print(f"error: {one_line}", file=sys.stderr)
     sys.exit(EXIT_BAD_INPUT)
 
 

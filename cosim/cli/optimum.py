@@ -49,6 +49,7 @@ def optimum(
             return
         document = _solve(task, refine, recompute, out_)
         out_.json(document)
+    # Without --refine nothing was asked that could be answered by no.
     if refine and document["objection"]:
         raise typer.Exit(1)
 
@@ -85,9 +86,13 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     from controllers.dynamic_programming import GainEstimate, Settings, certify, objection, solve
     from controllers.problem import PlantProblem
 
-    plant, settings = PlantProblem.from_scenario(task), Settings()
+    plant = PlantProblem.from_scenario(task)
+    settings = Settings()
     key = store.optimum_key(plant, settings)
-    path = None if refine or recompute else store.stored_file(key)
+    path = None
+    # A certificate belongs to the solution that it was made with.
+    if not (refine or recompute):
+        path = store.stored_file(key)
     show = _show_rounds(out_)
     solution = store.read_optimum(path, key) if path else solve(plant, settings, progress=show)
     if refine:
@@ -104,8 +109,10 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     figures = certificate or [
         GainEstimate("solution", solution.gain, solution.lower, solution.upper)
     ]
-    rows = [(name, *(f"{x:.4f}" for x in numbers)) for name, *numbers in figures]
-    states = " × ".join(map(str, solution.grid.shape))
+    rows = []
+    for name, *numbers in figures:
+        rows.append((name, *[f"{number:.4f}" for number in numbers]))
+    states = " × ".join(str(count) for count in solution.grid.shape)
     title = f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states"
     out_.table(title, ("", "J", "from", "to"), rows)
     if why_not is not None:

@@ -67,7 +67,9 @@ def simulate(
         out_.table(title, ("per sample", "value"), rows)
         out_.note(f"files are in {out.resolve()}")
         out_.json(summary)
-        if ended := summary.get("ended"):
+        # Only now: the samples before the failure are worth their files.
+        ended = summary.get("ended")
+        if ended:
             raise PlantError(f"{ended}; they are in {out.resolve()}")
 
 
@@ -123,6 +125,7 @@ def _simulate(
         summary["ended"] = ended
     run.write_csv(folder / "trajectory.csv")
     run.write_timing_csv(folder / "timing.csv")
+    # One sample makes no line.
     if 1 < len(run) <= MOST_DRAWN:
         run.plot(folder / "trajectory.png")
     (folder / "scenario.toml").write_text(scenario.to_toml(), "utf-8")

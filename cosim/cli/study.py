@@ -73,6 +73,7 @@ def _execute(
                 planned=planned,
                 figures=figures,
             )
+        # The other runs are done and stored: the same command tries these once more.
         except FailedRunsError as error:
             out_.note(f"failed: {error}")
             raise typer.Exit(1) from None
@@ -87,11 +88,11 @@ def show_plan(file: StudyFileArgument, json: cli.JsonOption = False) -> None:
         from cosim.studies.plan import plan
 
         planned = plan(cosim.Study.load(file))
-        runs = pd.DataFrame(
-            [(run.scenario.name, run.case, 1, run.samples) for run in planned.runs],
-            columns=["scenario", "case", "runs", "plant samples"],
-        )
-        rows = runs.groupby(["scenario", "case"], sort=False, as_index=False).sum()
+        columns = ["scenario", "case", "runs", "plant samples"]
+        runs = [(run.scenario.name, run.case, 1, run.samples) for run in planned.runs]
+        # In the order of the study's file, as its reports have it.
+        cases = pd.DataFrame(runs, columns=columns).groupby(columns[:2], sort=False, as_index=False)
+        rows = cases.sum()
         out_.table(
             f"{planned.definition.name}: {len(planned.runs)} runs, {planned.samples} plant samples",
             tuple(rows),
@@ -206,15 +207,18 @@ def check_results(
         from cosim.core.files import temporary_folder
         from cosim.studies import stored
 
+        # In a checkout its own studies count, which may be newer than the installed ones.
         local = Path("results")
-        folder = folder or (local if local.is_dir() else stored.stored_results())
+        if folder is None:
+            folder = local if local.is_dir() else stored.stored_results()
         studies = stored.stored_studies(folder)
         tolerances = stored.load_tolerances(folder)
         regression = [name for name, table in studies.items() if table.check]
         chosen = stored.chosen(studies, names or regression)
+        # What is missing, damaged or unknown is refused before the work, which takes minutes.
         for name in chosen:
             cosim.StudyResults.load(folder / name)
-            stored.compared_tables(folder / name)  # an unknown table is refused before the work
+            stored.compared_tables(folder / name)
         differences: dict[str, list[str]] = {}
         with temporary_folder("cosim-results-") as work:
             for name in chosen:
@@ -233,6 +237,7 @@ def check_results(
                 out_.note(line)
         same = not any(differences.values())
         out_.json({"same": same, "differences": differences})
+    # Bad input is an error of code 2; this is an answer.
     if not same:
         raise typer.Exit(1)
 
@@ -256,6 +261,7 @@ def update_results(
 
         studies = stored.stored_studies(folder)
         for name in stored.chosen(studies, names or list(studies)):
+            # Beside the stored tables, which are replaced when all runs are done.
             out = folder / stored.WORK / name
             _execute(folder / f"{name}.toml", out, out_, jobs=jobs).report()
             for table in stored.store(folder, name, out):

@@ -30,6 +30,7 @@ def view(
         if png is not None:
             render(file, png, at=at)
             out.note(f"drawn to {png}")
+        # A script that asks for JSON waits for no window.
         elif not json:
             open_viewer(file)
         if json:

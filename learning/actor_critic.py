@@ -14,7 +14,7 @@ from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.protocols import Matrix, Vector
-from cosim.core.scenario import Penalty, Positive, Scenario
+from cosim.core.scenario import NonNegative, Penalty, Positive, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, ExplorationProbability
@@ -45,6 +45,11 @@ class ActorCriticConfiguration(Configuration):
         1000,
         description="prediction errors over which the next value is expected; more where they are "
         "correlated in time",
+    )
+    persistence_doubt: NonNegative = Field(
+        4.0,
+        description="standard deviations by which errors must look correlated in time, or they "
+        "count as independent",
     )
     advantage_width: Positive = Field(
         0.1,
@@ -309,7 +314,9 @@ class ActorCritic(Algorithm):
         Of errors that are correlated in time more are kept, so that they say as much of the tails.
         """
         settings = self.configuration
-        n_errors = round(settings.prediction_errors * redundancy_of(states, errors))
+        n_errors = round(
+            settings.prediction_errors * redundancy_of(states, errors, settings.persistence_doubt)
+        )
         self._errors = PredictionErrors(self.scenario, n_errors)
         start = self.controller.parameters
         deviation = prior_deviation(

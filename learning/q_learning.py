@@ -35,8 +35,6 @@ Values = TypeVar("Values", float, NDArray[np.float64])
 
 LEAST_MEAN_SAMPLES = 10
 """Samples of the shortest mean of ∇Q: over M samples it takes 1/M of what each of them teaches."""
-PERSISTENCE_DOUBT = 4.0
-"""Standard deviations by which errors must look correlated in time before they count as that."""
 LEAST_ERRORS = 50
 """Errors that say something of their correlation, at least."""
 
@@ -106,6 +104,11 @@ class ValueConfiguration(Configuration):
     prediction_errors: Count = Field(
         1000,
         description="prediction errors over which the next penalty is expected",
+    )
+    persistence_doubt: NonNegative = Field(
+        4.0,
+        description="standard deviations by which errors must look correlated in time, or they "
+        "count as independent",
     )
     largest_step: NonNegative = Field(
         1.0,
@@ -437,8 +440,9 @@ class QLearning(ValueRule):
         deviation = variance**0.5
         start = self._begin_with_prior(states, errors, deviation)
         least_variance = np.finfo(np.float64).tiny
+        doubt = self.configuration.persistence_doubt
         self._regression = self._new_regression(max(variance, least_variance))
-        self._regression.redundancy = redundancy_of(states, errors)
+        self._regression.redundancy = redundancy_of(states, errors, doubt)
         return self._step.move(start.theta, deviation)
 
     def _new_regression(self, variance: float) -> KalmanRegression:
@@ -495,7 +499,7 @@ class QLearning(ValueRule):
         self._sum_of_squares = state["sum_of_squares"]
 
 
-def redundancy_of(states: Matrix, errors: Matrix) -> float:
+def redundancy_of(states: Matrix, errors: Matrix, doubt: float) -> float:
     """Consecutive samples that say as much as one independent sample, by the prediction errors.
 
     A disturbance with a memory makes errors, and with them TD errors, that are correlated in time.
@@ -504,6 +508,7 @@ def redundancy_of(states: Matrix, errors: Matrix) -> float:
     Args:
         states: s of consecutive samples, (K, n).
         errors: their prediction errors e, (K, n).
+        doubt: standard deviations by which they must look correlated in time.
 
     Returns:
         (1 + ρ)/(1 − ρ) of their autoregression; 1 where independent errors would look like it.
@@ -513,9 +518,7 @@ def redundancy_of(states: Matrix, errors: Matrix) -> float:
         return 1.0
     left = errors - linear_part(states, errors)
     unknown = np.zeros((n, n))
-    persistence = estimate_persistence(
-        left[1:], left[:-1], unknown, n_earlier=0, doubt=PERSISTENCE_DOUBT
-    )
+    persistence = estimate_persistence(left[1:], left[:-1], unknown, n_earlier=0, doubt=doubt)
     return 1.0 / effective_number(persistence, 1)
 
 

@@ -89,14 +89,14 @@ def test_redundancy_is_that_of_the_mean_of_an_autoregression(rng, memory):
     for k in range(1, len(errors)):
         errors[k] = memory * errors[k - 1] + rng.normal(size=2) * [1.0, 1e-3]
     states = rng.normal(size=errors.shape)
-    assert redundancy_of(states, errors) == pytest.approx((1 + memory) / (1 - memory), rel=0.3)
+    assert redundancy_of(states, errors, 4.0) == pytest.approx((1 + memory) / (1 - memory), rel=0.3)
 
 
 def test_independent_errors_are_not_redundant(rng):
     for _ in range(20):
         states, errors = rng.normal(size=(2, 500, 2)) * [1.0, 1e-3]
-        assert redundancy_of(states, errors) == 1.0
-    assert redundancy_of(np.ones((3, 2)), np.ones((3, 2))) == 1.0
+        assert redundancy_of(states, errors, 4.0) == 1.0
+    assert redundancy_of(np.ones((3, 2)), np.ones((3, 2)), 4.0) == 1.0
 
 
 def test_errors_of_a_wrong_model_are_not_redundant(rng):
@@ -105,7 +105,7 @@ def test_errors_of_a_wrong_model_are_not_redundant(rng):
     for k in range(1, len(states)):
         states[k] = 0.9 * states[k - 1] + rng.normal(size=2)
     errors = 0.5 * states + rng.normal(size=(500, 2))
-    assert redundancy_of(states, errors) == 1.0
+    assert redundancy_of(states, errors, 4.0) == 1.0
 
 
 def test_an_outlier_moves_no_further_than_the_clip():

@@ -165,6 +165,7 @@ class ActorCritic(Algorithm):
             "jacobian": np.zeros((size, m, n_theta)),
         }
         self._filled = 0  # rows of the open batch
+        self._redundancy = 1.0  # of consecutive prediction errors, by the first batch
         self._has_coordinates = False
         self._step = ConstrainedStep(self.controller, settings)
         self._information: Matrix = np.zeros((n_theta, n_theta))  # Σψψᵀ/r, with forgetting
@@ -219,17 +220,20 @@ class ActorCritic(Algorithm):
         at_policy = self._model(states, batch["policy"])
         following, prediction_errors, cost_surprise = self._predict(at_policy.following)
 
-        # The critic: the cost of the policy's action, and what is expected after it. That cost is
-        # the model's: a disturbance that lasts shifts realised costs and states together, which a
-        # fit would take for a slope of the value in the state.
+        # The critic: the cost of the policy's action, and what is expected after it. A disturbance
+        # that lasts shifts realised costs and states together, which a fit would take for a slope
+        # of the value in the state: the longer it lasts, the more the model's cost stands in.
         errors = self._errors.values
         penalty = ExpectedPenalty(self.scenario.state_penalty, errors)
-        reward = at_policy.cost + penalty.value(following)
+        independent_share = 1.0 / self._redundancy
+        cost = at_policy.cost + independent_share * cost_surprise
+        reward = cost + penalty.value(following)
         if not np.isfinite(reward + cost_surprise).all():
             raise DivergenceError("the costs or the predictions are not finite")
         td_errors = self._critic.fit(states, following, errors, reward)
-        # Realised costs speak in the advantage, which only samples that explore inform.
-        td_errors = td_errors + cost_surprise - cost_surprise.mean()
+        # The rest speaks in the advantage, which only samples that explore inform.
+        left_out = (1.0 - independent_share) * cost_surprise
+        td_errors = td_errors + left_out - left_out.mean()
 
         # The chain rule through the policy: ∇J = E[∇π ∇_a Q] (paper.tex, eq. pg_update).
         mean_error = errors.mean(axis=0)
@@ -314,9 +318,8 @@ class ActorCritic(Algorithm):
         Of errors that are correlated in time more are kept, so that they say as much of the tails.
         """
         settings = self.configuration
-        n_errors = round(
-            settings.prediction_errors * redundancy_of(states, errors, settings.persistence_doubt)
-        )
+        self._redundancy = redundancy_of(states, errors, settings.persistence_doubt)
+        n_errors = round(settings.prediction_errors * self._redundancy)
         self._errors = PredictionErrors(self.scenario, n_errors)
         start = self.controller.parameters
         deviation = prior_deviation(
@@ -390,6 +393,7 @@ class ActorCritic(Algorithm):
             **prefixed("critic", self._critic.state_dict()),
             **prefixed("step", self._step.state_dict()),
             "filled": self._filled,
+            "redundancy": self._redundancy,
             "has_coordinates": self._has_coordinates,
             "information": self._information,
             "moment": self._moment,
@@ -402,6 +406,7 @@ class ActorCritic(Algorithm):
         self._critic.load_state_dict(part_of(state, "critic"))
         self._step.load_state_dict(part_of(state, "step"))
         self._filled = state["filled"]
+        self._redundancy = state["redundancy"]
         self._has_coordinates = state["has_coordinates"]
         self._information = state["information"]
         self._moment = state["moment"]

@@ -186,19 +186,27 @@ def test_the_value_and_its_slopes_are_the_exact_ones(rng):
     assert value.gradient(states[:5]) == pytest.approx(2 * states[:5] @ P, rel=1e-3, abs=0.2)
 
 
-def test_a_cost_that_lasts_with_a_disturbance_is_no_slope_of_the_value(problem, scenario):
-    """Realised costs that go with the state, as a lasting disturbance makes them, say nothing."""
-    gradients = []
-    for share in (0.0, 50.0):
+def test_the_longer_errors_last_the_less_a_cost_that_follows_the_state_is_a_slope(
+    problem, scenario, monkeypatch
+):
+    """Realised costs that go with the state, as a lasting disturbance makes them."""
+
+    def gradient(redundancy, share):
         rng = np.random.default_rng(0)
+        monkeypatch.setattr("learning.actor_critic.redundancy_of", lambda *_: redundancy)
         actor = saturated(problem, scenario, rng, explores=False)
         batch = actor._batch
         batch["s"][400] = batch["next_s"][400] = scenario.initial_state
         batch["policy"][400] = batch["a"][400] = batch["policy"][0]
         batch["cost"] += share * (batch["s"][:, 0] - scenario.initial_state[0])
         batch["jacobian"] = rng.normal(size=batch["jacobian"].shape)
-        gradients.append(actor.gradient()[0])
-    np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-9)
+        return actor.gradient().gradient
+
+    changes = [gradient(redundancy, 50.0) - gradient(redundancy, 0.0) for redundancy in (1.0, 4.0)]
+    assert np.abs(changes[0]).max() > 0
+    # The critic is linear in the costs, so four times as long counts for a quarter.
+    largest = np.abs(changes[0]).max()
+    np.testing.assert_allclose(changes[1], changes[0] / 4.0, atol=1e-6 * largest)
 
 
 def test_a_constant_in_the_cost_is_the_mean_cost_and_nothing_else(rng):

@@ -15,9 +15,6 @@ import numpy as np
 from controllers.estimator import ExtendedKalmanFilter
 from cosim.core.protocols import Array, Vector
 
-REACH = 8.0
-"""Largest distance of a log variance from its prior mean."""
-
 
 def replay(estimator: ExtendedKalmanFilter, readings: Array, actions: Array) -> Array:
     """Run a filter over data; it ends at the last sample, after its correction.
@@ -73,15 +70,17 @@ def fit_noise(
         value = float(away @ away) / 2 - estimator.log_likelihood
         return value, away / prior_width - sensitivities.log_likelihood
 
-    # A θ file may be from far away.
-    start = np.clip(estimator.noise, prior_mean - REACH, prior_mean + REACH)
+    # Four deviations of the prior: a filter beyond them overflows. A θ file may be from far away.
+    least = prior_mean - 4.0 * prior_width
+    most = prior_mean + 4.0 * prior_width
+    start = np.clip(estimator.noise, least, most)
     with np.errstate(over="ignore", invalid="ignore"):  # of a filter that runs away
         result = minimize(
             loss,
             start,
             jac=True,
             method="L-BFGS-B",
-            bounds=Bounds(prior_mean - REACH, prior_mean + REACH),
+            bounds=Bounds(least, most),
             options={"maxiter": rounds, "maxfun": 2 * rounds},
         )
     best: Vector = result.x if np.isfinite(result.fun) else start

@@ -59,6 +59,11 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
         description="number of errors of an estimate as which a normal law counts, beside those "
         "that were seen",
     )
+    back_off_step: Positive = Field(
+        1.0,
+        description="first step of a back-off in the search under sensors, in deviations of the "
+        "predicted state; it is halved twice",
+    )
     shrink_samples: Count = Field(
         480,
         description="samples below which no back-off shrinks, under sensors",

@@ -32,9 +32,6 @@ from learning.gaussian_penalty import expected_penalties_with_errors
 from learning.innovations import fit_noise
 from learning.step import update_without_fit
 
-STEPS = ((1.0, 0.5), (0.25,))
-"""Steps of a back-off in each sweep, in deviations of the predicted state."""
-
 
 class ModelFromOutputs(Algorithm):
     """Operates with θ, fits filter and model to the readings, searches on them, and operates on.
@@ -371,7 +368,9 @@ class BackOffsBehindFilter:
             delta: present δ, (2n,).
             least: least δ, (2n,).
         """
-        for steps in STEPS:
+        step = self._settings.back_off_step
+        # A sweep that finds the place, and one that settles it.
+        for steps in ((step, step / 2), (step / 4,)):
             shows = self._settings.least_penalty_share * abs(self.cost(delta).mean)
             for i in np.flatnonzero(self.cost(delta).penalties > shows).tolist():
                 delta = self._along(delta, i, least[i], steps)

@@ -35,8 +35,6 @@ Values = TypeVar("Values", float, NDArray[np.float64])
 
 LEAST_MEAN_SAMPLES = 10
 """Samples of the shortest mean of ∇Q: over M samples it takes 1/M of what each of them teaches."""
-LEAST_ERRORS = 50
-"""Errors that say something of their correlation, at least."""
 
 
 class ValueConfiguration(Configuration):
@@ -514,7 +512,8 @@ def redundancy_of(states: Matrix, errors: Matrix, doubt: float) -> float:
         (1 + ρ)/(1 − ρ) of their autoregression; 1 where independent errors would look like it.
     """
     n_errors, n = errors.shape
-    if n_errors < LEAST_ERRORS:
+    # Of few errors the fits would leave nothing.
+    if n_errors < 25 * n:
         return 1.0
     left = errors - linear_part(states, errors)
     unknown = np.zeros((n, n))

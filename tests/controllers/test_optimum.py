@@ -119,8 +119,13 @@ def test_the_fmus_mean_cost_is_the_gain(policies, name):
     assert abs(J.mean() - policies[name].gain) < half_width
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "mismatched"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("paper", marks=pytest.mark.campaign),
+        pytest.param("mismatched", marks=pytest.mark.slow),
+    ],
+)
 def test_no_other_controller_has_a_lower_cost(name):
     names = ["optimal", "naive", "tuned", "converged"]
     J = paired(Scenario.load(name), names, seeds=20, steps=1000)

@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 PRESETS = {"paper", "nominal", "fast-sampling", "fouled", "mismatched", "drifting", "jump"}
 PRESETS |= {"reactor", "tanks", "holdup", "slow-sampling", "dead-time", "unstable-reactor"}
 PRESETS |= {"coloured-2", "coloured-5", "coloured-10", "assay", "assay-fouled", "late", "levels"}
+PRESETS |= {"prices", "set-point", "forecast"}
 
 
 # Other people's tools may warn; what is installed may not.

@@ -110,12 +110,6 @@ def test_each_study_has_noise_of_its_own_that_no_training_meets_and_enough_of_it
             assert used.setdefault(seed, name) == name, f"{name} and {used[seed]} share {seed}"
 
 
-@pytest.mark.slow
-def test_stored_results_hold():
-    code, output = check(STORED)
-    assert code == 0, output
-
-
 def test_what_was_stored_checks(mini):
     code, output = check(mini)
     assert code == 0, output

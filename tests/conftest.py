@@ -50,11 +50,18 @@ def pytest_unconfigure():
 
 
 @pytest.fixture(autouse=True)
-def helpers_stay_loaded():
-    """A test in which users' modules are loaded anew leaves those of the tests to the next one."""
-    before = {name: module for name, module in sys.modules.items() if name.startswith("tests.")}
+def modules_as_before():
+    """A test in which users' modules are loaded anew leaves those of the tests to the next one.
+
+    Nor does the next one look for modules in this one's folders.
+    """
+    from cosim.core import modules
+
+    tests = {name: module for name, module in sys.modules.items() if name.startswith("tests.")}
+    folders = list(modules._folders)
     yield
-    sys.modules.update(before)
+    sys.modules.update(tests)
+    modules._folders[:] = folders
 
 
 @pytest.fixture(scope="session")

@@ -64,8 +64,11 @@ def importing() -> Iterator[None]:
         written = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         added = [folder for folder in import_folders() if folder not in sys.path]
-        # A folder of such a name would be found before an editable install.
+        # A folder of such a name would be found before an editable install. Python looks for
+        # no package that is loaded, and nor does this: a stat of each folder costs more than it.
         for package in OURS:
+            if package in sys.modules:
+                continue
             for folder in added:
                 path = Path(folder, package)
                 if path.exists() or path.with_suffix(".py").exists():

@@ -9,7 +9,7 @@ from fmus import PLATFORMS, BuildError, present
 from fmus.build import build_folder
 from fmus.plant import Signal, build_plant, plant_model
 from tests.helpers.compiler import needs_compiler
-from tests.helpers.platforms import MARKS as CROSS
+from tests.helpers.platforms import CROSS
 
 pytestmark = needs_compiler
 EQUATIONS = """
@@ -72,7 +72,7 @@ def folder(tmp_path: Path) -> Path:
     return own
 
 
-@pytest.mark.parametrize("every", [False, pytest.param(True, marks=CROSS)])
+@pytest.mark.parametrize("every", [False, pytest.param(True, marks=[pytest.mark.slow, CROSS])])
 def test_a_folder_becomes_an_fmu_for_this_or_every_platform(folder: Path, tmp_path: Path, every):
     fmu = build_folder(folder, tmp_path / "tank.fmu", every_platform=every)
     platforms = PLATFORMS if every else [present()]

@@ -29,6 +29,9 @@ COVERED = {
     "cosim view run/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim optimum --scenario paper": "minutes; tests/cosim/cli/test_optimum.py",
     "cosim reproduce --budget quick": "minutes; tests/cosim/studies/test_stored.py",
+    "cosim export trained/parameters.toml --scenario fouled --out controller.fmu": (
+        "compiles for every platform; docs/how-to/deploy.md types it with --local"
+    ),
     "cosim study run study.toml --out study": "a synopsis; docs/how-to/study.md",
     "cosim study report study": "a synopsis; docs/how-to/study.md",
     "cosim compare run other-run": "a synopsis; tests/cosim/cli/test_compare.py",
@@ -40,6 +43,7 @@ SMALLER = {
     "naive,tuned,optimal,": "naive,tuned,",
     "--seeds 20 --steps 1000": "--seeds 2 --steps 100",
     "--samples 40000": "--samples 5000",
+    "--samples 1440": "--samples 300",
 }
 SLOW = {"scenario.md", "fmpy.md", "README.md"}
 CHECKER = doctest.OutputChecker()

@@ -31,12 +31,9 @@ WINE = Path("/usr/lib/wine/wine64")
 STEPS = 10_000
 VERSIONS: tuple[FmiVersion, ...] = (2, 3)
 LAWS = ("none", "uniform", "normal", "uniform, fouling", "normal, fouling")
-MARKS = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        importlib.util.find_spec("ziglang") is None, reason="the extra 'cross' is not installed"
-    ),
-]
+CROSS = pytest.mark.skipif(
+    importlib.util.find_spec("ziglang") is None, reason="the extra 'cross' is not installed"
+)
 """Of the tests that build or run other platforms' binaries."""
 # A host draws the inputs that it gives: with fused multiply-adds, which clang makes for ARM64 by
 # default and not for x86-64, they would be other inputs there.

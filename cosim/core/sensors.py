@@ -32,13 +32,14 @@ class Sensors:
     """
 
     def __init__(self, tables: Sequence[SensorTable]) -> None:
-        self.variables = tuple(table.variable for table in tables)
         self._tables = tuple(tables)
-        longest_delay = max(table.delay for table in tables)
-        self._memory = longest_delay + 1
+        self.variables = tuple(table.variable for table in tables)
         self._seed = 0
         # The variables' values at the last samples: sample j is in row j mod memory.
-        self._past: Array = np.full((self._memory, len(tables)), nan)
+        longest_delay = max(table.delay for table in tables)
+        self._memory = longest_delay + 1
+        past_shape = (self._memory, len(tables))
+        self._past: Array = np.full(past_shape, nan)
         # Of each sensor the block of draws that was used last, with its number.
         self._blocks: dict[int, tuple[int, Array]] = {}
 
@@ -74,7 +75,9 @@ class Sensors:
             taken = k - table.delay
             if taken < 0 or taken % table.every != 0:
                 continue
-            value = self._past[taken % self._memory, i]
+            row = taken % self._memory
+            value = self._past[row, i]
+            # A sensor without noise draws nothing: no other sensor's draws depend on it.
             if table.deviation > 0.0:
                 value += table.deviation * self._noise(i, taken)
             y[i] = value
@@ -118,11 +121,14 @@ class Sensors:
 
     def from_bytes(self, data: bytes) -> tuple[tuple[int, Array], bytes]:
         """A `state` from the begin of some bytes, and the rest of these; raises PlantError."""
-        end = _SEED.size + self._past.nbytes
+        begin = _SEED.size
+        end = begin + self._past.nbytes
         if len(data) < end:
             raise PlantError("these bytes are not the plant state of a scenario with these sensors")
         (seed,) = _SEED.unpack_from(data)
-        numbers = np.frombuffer(data[_SEED.size : end])
+        numbers = np.frombuffer(data[begin:end])
         # A copy: what lies in bytes cannot be written.
         past = numbers.reshape(self._past.shape).copy()
-        return (seed, past), data[end:]
+        state = (seed, past)
+        rest = data[end:]
+        return state, rest

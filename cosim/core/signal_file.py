@@ -27,13 +27,15 @@ def read_signal_file(path: str, name: str) -> dict[str, list[float]]:
             number; with file and line.
     """
     try:
+        # Excel puts a byte order mark before a CSV file in UTF-8.
         with Path(path).open(newline="", encoding="utf-8-sig") as stream:
             rows = [row for row in csv.reader(stream) if row]
     except (OSError, UnicodeDecodeError, ValueError, csv.Error) as cause:
         raise ValueError(f"signal '{name}': file '{path}' cannot be read: {cause}") from None
     titles = []
-    if rows:
-        titles = [title.partition("[")[0].strip() for title in rows[0]]
+    for cell in rows[0] if rows else ():
+        title, _, _ = cell.partition("[")
+        titles.append(title.strip())
     if name not in titles:
         known = ", ".join(titles) or "nothing"
         raise ValueError(f"signal '{name}': file '{path}' has no column '{name}'; it has {known}")
@@ -54,7 +56,9 @@ def _column_of(
     numbers = []
     # The titles are line 1.
     for line, row in enumerate(rows[1:], start=2):
+        # A row may be shorter than the titles.
         cell = row[place].strip() if place < len(row) else ""
+        # Infinity and NaN are numbers to Python, but no values of a signal.
         try:
             number = float(cell)
         except ValueError:

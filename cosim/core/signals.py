@@ -33,18 +33,26 @@ class Signals:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self.tables = scenario.valued_signals
-        signals = scenario.signals or ()
-        self.measured = tuple(signal for signal in signals if signal.measures is not None)
-        # Of each measured disturbance what is known at each sample of a run (`foresee`).
-        self._forecasts: dict[str, Array] = {}
         self._scenario = scenario
         self._h = scenario.sampling_time
-        self._times = [_times(table) for table in self.tables]
+        self.tables = scenario.valued_signals
+        self._times: list[list[float]] = []
         # Values at the first samples, so far as they have been asked for.
-        self._at_samples: list[Array] = [np.empty(0) for _ in self.tables]
-        self._bounds = [i for i, table in enumerate(self.tables) if table.bound is not None]
+        self._at_samples: list[Array] = []
+        # The numbers of those signals that are a bound.
+        self._bounds: list[int] = []
+        for i, table in enumerate(self.tables):
+            self._times.append(_times(table))
+            self._at_samples.append(np.empty(0))
+            if table.bound is not None:
+                self._bounds.append(i)
+        # A bound that steps takes few values: a penalty is made once for each of them.
         self._penalties: dict[tuple[float, ...], Penalty] = {}
+        self.measured = tuple(
+            signal for signal in scenario.signals or () if signal.measures is not None
+        )
+        # Of each measured disturbance what is known at each sample of a run (`foresee`).
+        self._forecasts: dict[str, Array] = {}
 
     @property
     def move_bounds(self) -> bool:
@@ -87,22 +95,24 @@ class Signals:
         if not self.measured:
             return
         scenario = self._scenario
+        # The last samples' previews reach beyond the end of the run.
         longest = max(_ahead(table, scenario) for table in self.measured)
-        plant.reset(seed)
-        steps = [plant.step(scenario.reference_action) for _ in range(samples + longest)]
-        realised = np.array([step.disturbance for step in steps])
+        realised = _realised(plant, seed, samples + longest)
         for number, table in enumerate(self.measured):
-            values = realised[:, scenario.plant.disturbances.index(str(table.measures))]
+            values = realised[:, self._disturbance_index(table)]
             ahead = _ahead(table, scenario)
-            known = np.lib.stride_tricks.sliding_window_view(values, ahead + 1)[:samples].copy()
-            # Errors add up sample by sample; a function of seed, signal, and sample alone.
-            key = np.array([seed, FORECAST_STREAM], dtype=np.uint64)
-            counter = np.array([0, 0, 0, number], dtype=np.uint64)
-            generator = np.random.Generator(np.random.Philox(key=key, counter=counter))
-            draws = generator.standard_normal((samples, ahead))
+            # Row k has the values of the samples k … k+ahead; the view's rows share memory.
+            windows = np.lib.stride_tricks.sliding_window_view(values, ahead + 1)
+            known = windows[:samples].copy()
+            # Errors add up sample by sample.
+            draws = _forecast_draws(seed, number, (samples, ahead))
             known[:, 1:] += table.error * np.cumsum(draws, axis=1)
             known.flags.writeable = False
             self._forecasts[table.name] = known
+
+    def _disturbance_index(self, table: SignalTable) -> int:
+        """Place of the disturbance that a signal measures, in the plant's order."""
+        return self._scenario.plant.disturbances.index(str(table.measures))
 
     def check_foreseen(self, disturbances: Array) -> None:
         """Check that a run realised what was foreseen.
@@ -114,9 +124,10 @@ class Signals:
             PlantError: a measured disturbance depends on the actions.
         """
         for table in self.measured:
-            place = self._scenario.plant.disturbances.index(str(table.measures))
+            realised = disturbances[:, self._disturbance_index(table)]
             foreseen = self._forecasts[table.name][: len(disturbances), 0]
-            if not np.array_equal(foreseen, disturbances[:, place]):
+            # To the bit: it is the same FMU with the same seed.
+            if not np.array_equal(foreseen, realised):
                 raise PlantError(
                     f"signal '{table.name}': disturbance '{table.measures}' is another one under "
                     "other actions, so that nobody can forecast it: take the signal out"
@@ -191,14 +202,16 @@ class Signals:
 
     def _find_values(self, i: int, end: int) -> None:
         """Look the values of signal i up, to before sample `end` and as many again."""
-        values = self._at_samples[i]
-        more = [self._value(i, k) for k in range(len(values), end)]
-        for k in range(end, 2 * end):
-            # It may have none beyond its end.
-            if not self._lasts_to(i, k):
+        present = self._at_samples[i]
+        # As many again, so that a run that asks sample by sample copies the array seldom.
+        more = []
+        for k in range(len(present), 2 * end):
+            # What was not asked for may be beyond the signal's end.
+            if k >= end and not self._lasts_to(i, k):
                 break
             more.append(self._value(i, k))
-        values = np.concatenate([values, more])
+        values = np.concatenate([present, more])
+        # Controllers are given parts of it.
         values.flags.writeable = False
         self._at_samples[i] = values
 
@@ -218,9 +231,17 @@ class Signals:
         upper = scenario.state_upper.copy()
         for i, value in zip(self._bounds, values, strict=True):
             table = self.tables[i]
-            bounds = lower if table.is_lower_bound else upper
-            bounds[scenario.plant.states.index(table.bounded_state)] = value
-        return Penalty(lower, upper, scenario.penalty_linear, scenario.penalty_quadratic)
+            state = scenario.plant.states.index(table.bounded_state)
+            if table.is_lower_bound:
+                lower[state] = value
+            else:
+                upper[state] = value
+        return Penalty(
+            lower,
+            upper,
+            scenario.penalty_linear,
+            scenario.penalty_quadratic,
+        )
 
     def penalties_along(self, states: Array, samples: NDArray[np.intp]) -> Array:
         """Penalties (K,) of states (K, n) at the bounds of their samples (K,)."""
@@ -238,12 +259,33 @@ class Signals:
 
     def _by_penalty(self, samples: NDArray[np.intp]) -> list[tuple[Penalty, NDArray[np.intp]]]:
         """The penalties of samples, each with the rows of its samples."""
-        penalties = [self.penalty(k) for k in samples.tolist()]
+        rows_of: dict[Penalty, list[int]] = {}
+        for row, k in enumerate(samples.tolist()):
+            rows_of.setdefault(self.penalty(k), []).append(row)
         groups = []
-        for penalty in dict.fromkeys(penalties):
-            rows = [row for row, other in enumerate(penalties) if other is penalty]
+        for penalty, rows in rows_of.items():
             groups.append((penalty, np.array(rows, dtype=np.intp)))
         return groups
+
+
+def _realised(plant: Plant, seed: int, samples: int) -> Array:
+    """Disturbances (samples, p) that a plant realises under the reference action."""
+    plant.reset(seed)
+    disturbances = []
+    for _ in range(samples):
+        step = plant.step(plant.scenario.reference_action)
+        disturbances.append(step.disturbance)
+    return np.array(disturbances)
+
+
+def _forecast_draws(seed: int, number: int, shape: tuple[int, int]) -> Array:
+    """Standard normal draws of a measured signal: a function of seed and signal alone."""
+    # As integers of 64 bits: in a list NumPy would round a large seed.
+    key = np.array([seed, FORECAST_STREAM], dtype=np.uint64)
+    # The low words of the counter are those that the draws count up.
+    counter = np.array([0, 0, 0, number], dtype=np.uint64)
+    philox = np.random.Philox(key=key, counter=counter)
+    return np.random.Generator(philox).standard_normal(shape)
 
 
 def _ahead(table: SignalTable, scenario: Scenario) -> int:

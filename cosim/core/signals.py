@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Mapping
 from math import floor
 
@@ -97,7 +98,8 @@ class Signals:
         scenario = self._scenario
         # The last samples' previews reach beyond the end of the run.
         longest = max(_ahead(table, scenario) for table in self.measured)
-        realised = _realised(plant, seed, samples + longest)
+        action = scenario.reference_action
+        realised = _realised(plant, seed, action, samples + longest)
         for number, table in enumerate(self.measured):
             values = realised[:, self._disturbance_index(table)]
             ahead = _ahead(table, scenario)
@@ -259,21 +261,29 @@ class Signals:
 
     def _by_penalty(self, samples: NDArray[np.intp]) -> list[tuple[Penalty, NDArray[np.intp]]]:
         """The penalties of samples, each with the rows of its samples."""
-        rows_of: dict[Penalty, list[int]] = {}
+        # A penalty is one object for all its samples (`_penalties`), so that it can be a key.
+        rows_of: dict[Penalty, list[int]] = defaultdict(list)
         for row, k in enumerate(samples.tolist()):
-            rows_of.setdefault(self.penalty(k), []).append(row)
+            penalty = self.penalty(k)
+            rows_of[penalty].append(row)
         groups = []
         for penalty, rows in rows_of.items():
-            groups.append((penalty, np.array(rows, dtype=np.intp)))
+            indices = np.array(rows, dtype=np.intp)
+            groups.append((penalty, indices))
         return groups
 
 
-def _realised(plant: Plant, seed: int, samples: int) -> Array:
-    """Disturbances (samples, p) that a plant realises under the reference action."""
+def _realised(
+    plant: Plant,
+    seed: int,
+    action: Array,
+    samples: int,
+) -> Array:
+    """Disturbances (samples, p) that a plant realises under an action (m,)."""
     plant.reset(seed)
     disturbances = []
     for _ in range(samples):
-        step = plant.step(plant.scenario.reference_action)
+        step = plant.step(action)
         disturbances.append(step.disturbance)
     return np.array(disturbances)
 

@@ -48,9 +48,11 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     exploration noise (common random numbers). Raises CosimError on a negative seed.
     """
     seed = whole_number("seed", seed, 0, CosimError)
-    plant, exploration = np.random.SeedSequence(seed).spawn(2)
+    root = np.random.SeedSequence(seed)
+    plant, exploration = root.spawn(2)
     (plant_seed,) = plant.generate_state(1, np.uint64)
-    return int(plant_seed), np.random.default_rng(exploration)
+    generator = np.random.default_rng(exploration)
+    return int(plant_seed), generator
 
 
 def simulate(
@@ -88,7 +90,8 @@ def simulate(
     signals = signals_of(plant.scenario)
     if signals is not None:
         signals.require(steps)
-        signals.foresee(plant, spawn_seeds(seed)[0], steps)
+        plant_seed, _ = spawn_seeds(seed)
+        signals.foresee(plant, plant_seed, steps)
     _compile_for(controller, steps)
     # The columns are there before the recorder opens its file: they may not fit the memory.
     run = _Run(plant, controller, steps, seed, residuals, signals)
@@ -113,6 +116,7 @@ def simulate(
         ended.trajectory = run.trajectory()
         raise ended from error
     trajectory = run.trajectory()
+    # A forecast of what followed the actions was made under other ones: such a run is no result.
     if signals is not None:
         signals.check_foreseen(trajectory.disturbances)
     return trajectory
@@ -120,8 +124,10 @@ def simulate(
 
 def _compile_for(controller: Controller, steps: int) -> None:
     """Compile an interpreted NMPC, behind an estimator too, if the run is long enough for it."""
+    # An estimator (`controllers.OutputFeedback`) has the controller that it feeds.
     nmpc: Any = getattr(controller, "controller", controller)
-    if functions_of(nmpc) == "interpreted" and hasattr(type(nmpc), "compile"):
+    is_interpreted = functions_of(nmpc) == "interpreted"
+    if is_interpreted and hasattr(type(nmpc), "compile"):
         nmpc.compile(steps)
 
 
@@ -133,11 +139,14 @@ def compiled_loop(plant: Plant, controller: Controller) -> CompiledLoop | None:
         controller: the feedback law.
     """
     # Methods of the classes: a wrapper that hands on all attributes samples in a way of its own.
-    if not hasattr(type(plant), "drive") or not hasattr(type(controller), "compiled_loop"):
+    if not hasattr(type(plant), "drive"):
+        return None
+    if not hasattr(type(controller), "compiled_loop"):
         return None
     if not getattr(plant, "drivable", False):
         return None
-    loop: CompiledLoop | None = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
+    nmpc: Any = controller
+    loop: CompiledLoop | None = nmpc.compiled_loop(plant.scenario)
     return loop
 
 
@@ -160,26 +169,33 @@ class _Run:
         scenario = plant.scenario
         self._plant = plant
         self._controller = controller
-        known = None if signals is None else signals.known
-        self._loop = ClosedLoop(plant.step, controller, scenario, known=known)
         self._scenario = scenario
         self._seed = seed
         self._steps = steps
         self._residuals = residuals
-        self._length = min(max(PART, steps // 200), 10 * PART)
+        known = None if signals is None else signals.known
+        self._loop = ClosedLoop(plant.step, controller, scenario, known=known)
+        # Samples of a part, after which progress is reported and a recorder is served.
+        part_of_run = max(PART, steps // 200)
+        self._length = min(part_of_run, 10 * PART)
         self._columns: dict[str, Array] = {}
         widths = {}
         for kind in SIGNALS:
-            widths[kind.name] = len(kind.names(scenario))
+            width = len(kind.names(scenario))
+            widths[kind.name] = width
             # Column-major, so that a signal is a column and not a copy of one. What is never
             # written takes no memory; a clock is not as precise as a float of 32 bits.
-            shape = (steps, widths[kind.name]) if kind.vector else (steps,)
+            shape = (steps, width) if kind.vector else (steps,)
             dtype = np.float32 if kind.clock else np.float64
             self._columns[kind.name] = np.zeros(shape, dtype, order="F")
-        self._ends = np.cumsum([widths[name] for name in MEASURED])
+        # Where each measured signal ends in a row of the loop's table.
+        measured_widths = [widths[name] for name in MEASURED]
+        self._ends = np.cumsum(measured_widths)
         self._status: list[str] = []
+        # What a part's solutions predict, by name; nothing until one of them does.
         self._predicted: dict[str, Array] = {}
-        self._without_estimate = np.full(len(scenario.estimate_names), nan)
+        n_estimates = len(scenario.estimate_names)
+        self._without_estimate = np.full(n_estimates, nan)
         self._final_state: Array | None = None
         self.done = 0
 
@@ -194,8 +210,10 @@ class _Run:
         """
         rows: list[list[float]] = []
         loop = self._loop
-        s = self._plant.reset(spawn_seeds(self._seed)[0])
-        loop.start(s, getattr(self._plant, "y", None))
+        plant_seed, _ = spawn_seeds(self._seed)
+        s = self._plant.reset(plant_seed)
+        y = getattr(self._plant, "y", None)
+        loop.start(s, y)
         reported_at = perf_counter()
         try:
             for k in range(self._steps):
@@ -268,7 +286,8 @@ class _Run:
             progress: is called with the number of samples done.
         """
         plant: Any = self._plant
-        plant.reset(spawn_seeds(self._seed)[0])
+        plant_seed, _ = spawn_seeds(self._seed)
+        plant.reset(plant_seed)
         # In parts, so that progress is shown and Ctrl-C is heard; short ones of a slow plant.
         length = FIRST_PART
         end = 0
@@ -278,19 +297,24 @@ class _Run:
             # A part ends where Python's loop reports.
             next_report = first - first % PART + PART
             end = min(first + length, next_report, self._steps)
-            table = np.full((end - first, self._ends[-1]), nan)
+            n_numbers = self._ends[-1]
+            table = np.full((end - first, n_numbers), nan)
             try:
                 self._final_state = plant.drive(loop, table)
             except PlantError:
                 # The plant's time, a row's last number, is written after its step.
-                count = int(np.isfinite(table[:, -1]).sum())
-                self._final_state = table[count, : self._ends[0]].copy()
+                is_done = np.isfinite(table[:, -1])
+                count = int(is_done.sum())
+                # The state is a row's first signal; that of the failed step stands there already.
+                n_states = self._ends[0]
+                self._final_state = table[count, :n_states].copy()
                 self._keep(first, table[:count])
                 raise
             self._keep(first, table)
             seconds = perf_counter() - begin
             if end in (next_report, self._steps) or seconds > PART_SECONDS / 4:
                 progress(end)
+            # Longer parts while they are fast: each of them costs a call and its conversion.
             if seconds > PART_SECONDS:
                 length = max(1, length // 2)
             elif seconds < PART_SECONDS / 4:
@@ -298,10 +322,13 @@ class _Run:
 
     def _keep(self, first: int, table: Array) -> None:
         """Store rows of the compiled loop with their status."""
+        # A signal begins where the one before it ends.
         position = self._ends[MEASURED.index("failed") - 1]
         for number in table[:, position]:
-            self._status.append(LOOP_STATUSES[int(number)])
-        table[:, position] = table[:, position] == LOOP_STATUSES.index(FALLBACK)
+            word = LOOP_STATUSES[int(number)]
+            self._status.append(word)
+        fallback = LOOP_STATUSES.index(FALLBACK)
+        table[:, position] = table[:, position] == fallback
         self._fill(first, table)
 
     def _fill(self, first: int, table: Array) -> dict[str, Array]:
@@ -309,7 +336,9 @@ class _Run:
         end = first + len(table)
         self.done = end
         # Views of the whole run's columns.
-        stored = {name: column[first:end] for name, column in self._columns.items()}
+        stored = {}
+        for name, column in self._columns.items():
+            stored[name] = column[first:end]
         samples = np.arange(first, end)
         # k·h, never a sum of h.
         stored["time"][:] = samples * self._scenario.sampling_time
@@ -336,9 +365,12 @@ class _Run:
         if type(value) is float:
             return value
         numbers = int | float | np.integer | np.floating
-        if isinstance(value, bool) or not isinstance(value, numbers):
+        # To Python a truth is a number.
+        is_number = isinstance(value, numbers) and not isinstance(value, bool)
+        if not is_number:
             # An array's text has several lines; a message is one.
-            one_line = " ".join(f"{value!r:.60}".split())
+            words = f"{value!r:.60}".split()
+            one_line = " ".join(words)
             # The loop has counted this sample already.
             sample = self._loop.number - 1
             raise self._loop.wrong(f"a {name} that is no number but {one_line}", sample)
@@ -346,9 +378,12 @@ class _Run:
 
     def _keep_prediction(self, k: int, solution: Solution) -> None:
         """Keep what a solution predicts, for the recorder, if it does."""
-        predictions: dict[str, Any] = {name: getattr(solution, name) for name in PREDICTED}
-        if any(values is None for values in predictions.values()):
-            return
+        predictions: dict[str, Any] = {}
+        for name in PREDICTED:
+            values = getattr(solution, name)
+            if values is None:
+                return
+            predictions[name] = values
         row = k % self._length
         try:
             for name, values in predictions.items():
@@ -368,13 +403,17 @@ class _Run:
         signals: dict[str, Signal] = {}
         timing = {}
         for kind in SIGNALS:
-            values = self._columns[kind.name].reshape(self._steps, -1)[: self.done]
+            # A signal that is no vector has one column; a run that failed has fewer rows.
+            table = self._columns[kind.name].reshape(self._steps, -1)
+            values = table[: self.done]
             if kind.clock:
-                timing[kind.name.removesuffix("_time")] = values[:, 0]
+                phase = kind.name.removesuffix("_time")
+                timing[phase] = values[:, 0]
                 continue
             units = kind.units(scenario, self._plant.units)
             for (name, unit), column in zip(units.items(), values.T, strict=True):
-                signals[name] = Signal(name, unit, np.ascontiguousarray(column))
+                contiguous = np.ascontiguousarray(column)
+                signals[name] = Signal(name, unit, contiguous)
         return Trajectory(
             scenario=scenario,
             signals=signals,
@@ -389,7 +428,10 @@ class _Run:
 def functions_of(controller: Any) -> str | None:
     """How a controller's functions are computed, `interpreted` or `compiled`; None without any."""
     mode = getattr(controller, "functions", None)
-    return mode if isinstance(mode, str) else None
+    # A user's controller may have an attribute of this name for something else.
+    if not isinstance(mode, str):
+        return None
+    return mode
 
 
 def indicators(run: Trajectory, burn_in: int = 0) -> dict[str, float]:
@@ -432,7 +474,8 @@ def measure(
     """
     begin = perf_counter()
     run = simulate(plant, controller, burn_in + steps, seed, residuals=False)
-    clock = {"wall_time_s": perf_counter() - begin}
+    seconds = perf_counter() - begin
+    clock = {"wall_time_s": seconds}
     for phase, quantiles in run.timing_summary().items():
         for name, value in quantiles.items():
             clock[f"{phase}_{name}"] = value
@@ -523,7 +566,8 @@ def reporting(
         rich_progress.TextColumn("{task.fields[remark]}"),
     )
     # Drawn from here, not by a thread of its own, ten times a second at most.
-    with rich_progress.Progress(*columns, console=console, auto_refresh=False) as bar:
+    shown = rich_progress.Progress(*columns, console=console, auto_refresh=False)
+    with shown as bar:
         task = bar.add_task(label, total=total, remark="")
         last_drawn = 0.0
 
@@ -531,8 +575,9 @@ def reporting(
             nonlocal last_drawn
             done, remark = read(*news)
             bar.update(task, completed=done, remark=remark)
-            if perf_counter() - last_drawn >= REFRESH:
-                last_drawn = perf_counter()
+            now = perf_counter()
+            if now - last_drawn >= REFRESH:
+                last_drawn = now
                 bar.refresh()
 
         yield update

@@ -63,8 +63,10 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     value = above / below
     # An infinite cost has no interval.
     with np.errstate(invalid="ignore"):
-        linearised = (numerator - value * denominator) / below
-    return Estimate(value, _t_interval(linearised, value))
+        errors = numerator - value * denominator
+        linearised = errors / below
+    interval = _t_interval(linearised, value)
+    return Estimate(value, interval)
 
 
 def bootstrapped(numerator: Array, denominator: Array) -> Interval:
@@ -78,7 +80,9 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
         None for one seed, for more than `RESAMPLED`, and where a value is not finite.
     """
     seeds = len(numerator)
-    if not 2 <= seeds <= RESAMPLED or not np.isfinite(numerator).all():
+    if not 2 <= seeds <= RESAMPLED:
+        return None
+    if not np.isfinite(numerator).all():
         return None
     above = np.sum(numerator)
     below = np.sum(denominator)
@@ -96,7 +100,9 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
         below: Array,
         axis: int,
     ) -> Any:
-        return np.mean(above, axis=axis) / np.mean(below, axis=axis)
+        mean_above = np.mean(above, axis=axis)
+        mean_below = np.mean(below, axis=axis)
+        return mean_above / mean_below
 
     return _bootstrap((numerator, denominator), quotient, paired=True, method="BCa")
 
@@ -111,12 +117,14 @@ def _bootstrap(data: Sequence[Array], statistic: Callable[..., Any], **options: 
     """Interval of a statistic of resampled data, with a fixed seed."""
     from scipy import stats  # noqa: PLC0415 - most of a second
 
+    # SciPy draws a batch of resamples at once, and keeps it: a limit of the memory.
     longest = max(len(values) for values in data)
+    batch = max(1, AT_ONCE // longest)
     result = stats.bootstrap(
         tuple(data),
         statistic,
         n_resamples=RESAMPLES,
-        batch=max(1, AT_ONCE // longest),
+        batch=batch,
         confidence_level=LEVEL,
         # The same table has the same interval, whoever makes it.
         rng=np.random.default_rng(0),
@@ -219,8 +227,10 @@ def gaps_closed(
 def _quotients(numerator: Array, denominator: Array | float) -> Array:
     """Quotients, NaN where the denominator is zero."""
     defined = denominator != 0
+    # NumPy would warn of a division by zero, even where the quotient is not used.
     safe = np.where(defined, denominator, 1.0)
-    return np.where(defined, numerator / safe, np.nan)
+    quotients = numerator / safe
+    return np.where(defined, quotients, np.nan)
 
 
 def interquartile_mean(values: Array, axis: int = -1) -> Any:
@@ -261,10 +271,14 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
     Returns:
         The mean; no interval where a run is not finite, or where a stratum has only one.
     """
-    value = float(interquartile_mean(np.concatenate(list(strata))))
+    all_runs = np.concatenate(list(strata))
+    value = float(interquartile_mean(all_runs))
     every_run_equal = True
     for runs in strata:
-        if len(runs) < 2 or not np.isfinite(runs).all():
+        # One run resampled is that run: it shows no spread.
+        if len(runs) < 2:
+            return Estimate(value)
+        if not np.isfinite(runs).all():
             return Estimate(value)
         if not _all_equal(runs, value):
             every_run_equal = False
@@ -273,8 +287,8 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
         return Estimate(value, (value, value))
 
     def middle(*resampled: Array, axis: int) -> Any:
-        all_runs = np.concatenate(resampled, axis=axis)
-        return interquartile_mean(all_runs, axis)
+        drawn = np.concatenate(resampled, axis=axis)
+        return interquartile_mean(drawn, axis)
 
     interval = _bootstrap(strata, middle, method="percentile")
     return Estimate(value, interval)
@@ -302,17 +316,26 @@ def td_error_mean(
     errors = np.where(counts > 0, td_error, 0.0)
     row_squares = errors**2 * counts
     # Sums over a window are differences of sums from the start, which begin with 0.
-    count_sums = np.append(0.0, np.cumsum(counts))
-    square_sums = np.append(0.0, np.cumsum(row_squares))
+    count_sums = _sums_from_start(counts)
+    square_sums = _sums_from_start(row_squares)
+    # Rows count that lie in the window whole: those from the first begin in it on.
     ends = np.append(0.0, samples)
-    first = np.searchsorted(ends, samples - window, side="left")
+    window_starts = samples - window
+    first = np.searchsorted(ends, window_starts, side="left")
     n_updates = count_sums[1:] - count_sums[first]
     squares = square_sums[1:] - square_sums[first]
     # Rounding may leave a sum of squares below zero.
     squares = np.maximum(squares, 0.0)
     has_updates = n_updates > 0
-    mean_square = squares / np.where(has_updates, n_updates, 1.0)
-    return np.where(has_updates, np.sqrt(mean_square), np.nan)
+    divisors = np.where(has_updates, n_updates, 1.0)
+    window_errors = np.sqrt(squares / divisors)
+    return np.where(has_updates, window_errors, np.nan)
+
+
+def _sums_from_start(values: Array) -> Array:
+    """Sums of the first 0, 1, …, K of K values, (K+1,)."""
+    sums = np.cumsum(values)
+    return np.append(0.0, sums)
 
 
 def shown(
@@ -349,9 +372,11 @@ def decimals(value: float, digits: int) -> int:
     """
     if not isfinite(value) or value == 0:
         return 0
+    # The power of ten of the first significant digit.
     first_digit = floor(log10(abs(value)))
     needed = digits - 1 - first_digit
-    return min(max(needed, 0), 9)
+    at_least_none = max(needed, 0)
+    return min(at_least_none, 9)
 
 
 def magnitude(reference: Array) -> Array:
@@ -363,13 +388,18 @@ def magnitude(reference: Array) -> Array:
 def _t_interval(errors: Array, value: float) -> Interval:
     """Student's interval; None for fewer than two values, or where one is not finite."""
     count = len(errors)
-    if count < 2 or not np.isfinite(errors).all():
+    if count < 2:
+        return None
+    if not np.isfinite(errors).all():
         return None
     # Not by scipy.stats, which takes most of a second to import.
     quantile = stdtrit(count - 1, 0.5 + LEVEL / 2)
-    standard_error = np.std(errors, ddof=1) / np.sqrt(count)
+    deviation = np.std(errors, ddof=1)
+    standard_error = deviation / np.sqrt(count)
     half = float(quantile * standard_error)
-    return value - half, value + half
+    low = value - half
+    high = value + half
+    return low, high
 
 
 def paired_difference(
@@ -391,12 +421,14 @@ def paired_difference(
         The median, its interval over pairs and noise, and p, NaN for fewer than two pairs.
     """
     # Of each pair the mean over its noise.
-    differences = (cost - other).mean(axis=1) / magnitude(optimum).mean()
+    mean_differences = (cost - other).mean(axis=1)
+    differences = mean_differences / magnitude(optimum).mean()
     # A cost that is no number is the worst.
     differences = np.where(np.isnan(differences), np.inf, differences)
     median = float(np.median(differences))
     interval = two_way(cost, optimum, other)
-    return median, interval, _sign_flip_probability(differences)
+    probability = _sign_flip_probability(differences)
+    return median, interval, probability
 
 
 def _sign_flip_probability(differences: Array) -> float:
@@ -406,21 +438,25 @@ def _sign_flip_probability(differences: Array) -> float:
         return float("nan")
     from scipy.stats import rankdata  # noqa: PLC0415 - most of a second
 
-    ranks = rankdata(np.abs(differences))
+    sizes = np.abs(differences)
+    ranks = rankdata(sizes)
     rank_sum = float(np.sign(differences) @ ranks)
     # Sums of ranks are multiples of a half: rounding must not decide.
     observed = abs(rank_sum) - 1e-9
     if count > EXHAUSTIVE_PAIRS:
         rng = np.random.default_rng(0)
         signs = rng.choice([-1.0, 1.0], size=(RESAMPLES, count))
-        reached = np.abs(signs @ ranks) >= observed
+        rank_sums = signs @ ranks
+        reached = np.abs(rank_sums) >= observed
         # What was observed is one of the ways, too.
-        return float((1 + reached.sum()) / (1 + RESAMPLES))
+        n_reached = 1 + reached.sum()
+        return float(n_reached / (1 + RESAMPLES))
     # Row k has the bits of k as signs.
     numbers = np.arange(2**count)[:, None]
     bits = (numbers >> np.arange(count)) & 1
     signs = 2.0 * bits - 1
-    reached = np.abs(signs @ ranks) >= observed
+    rank_sums = signs @ ranks
+    reached = np.abs(rank_sums) >= observed
     return float(reached.mean())
 
 
@@ -437,12 +473,17 @@ def median_over_runs(values: Array) -> Estimate:
     """
     value = float(np.median(values))
     count = len(values)
-    if count < 2 or np.isnan(values).any():
+    if count < 2:
+        return Estimate(value)
+    # An infinite value has a rank, and so a percentile; a NaN has none.
+    if np.isnan(values).any():
         return Estimate(value)
     rng = np.random.default_rng(0)
     drawn = rng.integers(count, size=(count, RESAMPLES))
-    medians = np.median(values[drawn], axis=0)
-    return Estimate(value, _percentiles(medians))
+    resampled = values[drawn]
+    medians = np.median(resampled, axis=0)
+    interval = _percentiles(medians)
+    return Estimate(value, interval)
 
 
 def _percentiles(resampled: Array) -> Interval:
@@ -477,7 +518,8 @@ def two_way(
     if n_seeds < 2:
         return None
     rng = np.random.default_rng(0)
-    draws = max(1, min(RESAMPLES, AT_ONCE // n_seeds))
+    fitting = AT_ONCE // n_seeds
+    draws = max(1, min(RESAMPLES, fitting))
     # How often each seed is drawn, as a weight: a resampled mean is a product.
     equal = np.full(n_seeds, 1 / n_seeds)
     counts = rng.multinomial(n_seeds, equal, size=draws)
@@ -485,8 +527,10 @@ def two_way(
     # An infinite cost stays one in every draw, where 0·∞ would be no number.
     finite = np.isfinite(terms).all(axis=1)
     values = np.full((n_runs, draws), np.inf)
-    values[finite] = terms[finite] @ weights / (below @ weights)
+    above = terms[finite] @ weights
+    values[finite] = above / (below @ weights)
     # In each draw of the noise, as many runs as there are, with replacement.
     drawn = rng.integers(n_runs, size=(n_runs, draws))
     resampled = np.take_along_axis(values, drawn, axis=0)
-    return _percentiles(np.median(resampled, axis=0))
+    medians = np.median(resampled, axis=0)
+    return _percentiles(medians)

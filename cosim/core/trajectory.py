@@ -73,29 +73,34 @@ class SignalKind:
 
 
 def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
+    states = columns["states"]
     signals = signals_of(scenario)
+    # One penalty for all samples, without a look at each sample's bounds.
     if signals is None or not signals.move_bounds:
-        return scenario.state_penalty.along(columns["states"])
+        return scenario.state_penalty.along(states)
     samples = sample_numbers(columns["time"], scenario)
-    return signals.penalties_along(columns["states"], samples)
+    return signals.penalties_along(states, samples)
 
 
 def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
+    states = columns["states"]
     signals = signals_of(scenario)
     if signals is None or not signals.move_bounds:
-        violations = scenario.state_penalty.violation(columns["states"])
+        violations = scenario.state_penalty.violation(states)
     else:
         samples = sample_numbers(columns["time"], scenario)
-        violations = signals.violations_along(columns["states"], samples)
+        violations = signals.violations_along(states, samples)
     total: Array = violations.sum(axis=1)
     return total
 
 
 def _signals(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
     signals = signals_of(scenario)
+    times = columns["time"]
     if signals is None:
-        return np.empty((len(columns["time"]), 0))
-    return signals.along(sample_numbers(columns["time"], scenario))
+        return np.empty((len(times), 0))
+    samples = sample_numbers(times, scenario)
+    return signals.along(samples)
 
 
 # Loop, CSV, recording and comparison follow this table: a derived signal is declared here alone.
@@ -164,7 +169,8 @@ class RunSignals:
         return path.stem
 
     def __len__(self) -> int:
-        return max((len(signal.values) for signal in self.signals.values()), default=0)
+        lengths = [len(signal.values) for signal in self.signals.values()]
+        return max(lengths, default=0)
 
 
 @dataclass(frozen=True, repr=False)
@@ -191,18 +197,19 @@ class Trajectory(Result):
         missing = []
         for kind in SIGNALS:
             # Times that a clock measured lie in `timing`.
-            if not kind.clock:
-                names = kind.names(self.scenario)
-                missing += [name for name in names if name not in self.signals]
+            if kind.clock:
+                continue
+            for name in kind.names(self.scenario):
+                if name not in self.signals:
+                    missing.append(name)
         if missing:
             raise TrajectoryError(f"the trajectory lacks the signal {', '.join(missing)}")
         # All are of one length: a figure or a mean would else pair unlike samples.
         samples = len(self.status)
         for signal in self.signals.values():
-            if signal.values.shape != (samples,):
-                raise TrajectoryError(
-                    f"signal '{signal.name}' has shape {signal.values.shape}, not ({samples},)"
-                )
+            shape = signal.values.shape
+            if shape != (samples,):
+                raise TrajectoryError(f"signal '{signal.name}' has shape {shape}, not ({samples},)")
 
     def __len__(self) -> int:
         return len(self.status)
@@ -236,6 +243,7 @@ class Trajectory(Result):
         columns: dict[str, Any] = {}
         for name, signal in self.signals.items():
             columns[name] = signal.values
+        # Last, as in the CSV.
         columns[STATUS] = list(self.status)
         return pd.DataFrame(columns)
 
@@ -289,15 +297,17 @@ class Trajectory(Result):
 
         `failures` are samples under the fallback action; `statuses` samples by status.
         """
-        statuses = Counter(self.status)
+        failures = np.sum(self["failed"])
+        # In the order of the words: that of their first samples would differ from run to run.
+        statuses = sorted(Counter(self.status).items())
         final_state = None
         if self.final_state is not None:
             final_state = self.final_state.tolist()
         return {
             "samples": len(self),
             **self.means(),
-            "failures": int(np.sum(self["failed"])),
-            "statuses": dict(sorted(statuses.items())),
+            "failures": int(failures),
+            "statuses": dict(statuses),
             "final_state": final_state,
         }
 
@@ -306,17 +316,20 @@ class Trajectory(Result):
         shares = list(QUANTILES.values())
         summary = {}
         for phase, seconds in self.timing.items():
-            quantiles = 1e6 * np.quantile(seconds, shares)
-            summary[phase] = dict(zip(QUANTILES, quantiles.tolist(), strict=True))
+            microseconds = 1e6 * np.quantile(seconds, shares)
+            named = zip(QUANTILES, microseconds.tolist(), strict=True)
+            summary[phase] = dict(named)
         return summary
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
-        return csv_text(*self._table())
+        header, rows = self._table()
+        return csv_text(header, rows)
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `to_csv` to a file, whole or not at all."""
-        return _write(path, *self._table())
+        header, rows = self._table()
+        return _write(path, header, rows)
 
     def write_timing_csv(self, path: str | Path) -> Path:
         """Write the wall-clock times in µs to a file, apart from what must repeat to the bit."""
@@ -325,7 +338,8 @@ class Trajectory(Result):
 
     def _timing_rows(self) -> Iterator[list[str]]:
         """Rows of the CSV of wall-clock times, in µs."""
-        for seconds in _rows(list(self.timing.values())):
+        columns = list(self.timing.values())
+        for seconds in _rows(columns):
             yield [f"{1e6 * value:.3f}" for value in seconds]
 
     def _table(self) -> tuple[list[str], Iterator[list[str]]]:
@@ -344,11 +358,12 @@ class Trajectory(Result):
         whole_kinds = {kind.name for kind in SIGNALS if kind.whole}
         whole_columns = []
         columns = []
-        for index, (name, signal) in enumerate(self.signals.items()):
-            columns.append(signal.values)
+        for name, signal in self.signals.items():
             if name in whole_kinds:
-                whole_columns.append(index)
-        for numbers, status in zip(_rows(columns), self.status, strict=True):
+                whole_columns.append(len(columns))
+            columns.append(signal.values)
+        rows = _rows(columns)
+        for numbers, status in zip(rows, self.status, strict=True):
             # `repr` is the shortest text that reads back to the same bits.
             cells = [repr(number) for number in numbers]
             for index in whole_columns:
@@ -364,6 +379,7 @@ def _write(
 ) -> Path:
     # Whole or not at all: a reader never sees half of it.
     with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
+        # On Windows too: the same run has the same bytes on each system.
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(header)
         writer.writerows(rows)
@@ -376,6 +392,7 @@ def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:
     # A part at a time: a number of Python's takes four times the memory of NumPy's.
     for first in range(0, n_rows, ROWS_AT_ONCE):
         end = first + ROWS_AT_ONCE
+        # `tolist` gives Python's numbers, whose `repr` is the plain digits.
         part = [column[first:end].tolist() for column in columns]
         yield from zip(*part, strict=True)
 
@@ -412,7 +429,7 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
     if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
     header, *body = rows
-    *titles, _ = header
+    titles = header[:-1]
     values = np.empty((len(body), len(titles)))
     status = []
     for index, row in enumerate(body):
@@ -428,11 +445,13 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
             raise TrajectoryError(f"'{path}', line {line}: {error}") from None
     signals: dict[str, Signal] = {}
     for title, column in zip(titles, values.T, strict=True):
-        name, _, unit = title.partition(" [")
+        name, _, rest = title.partition(" [")
+        unit = rest.removesuffix("]")
         # The later one would replace the first without a word.
         if name in signals:
             raise TrajectoryError(f"'{path}' has two columns '{name}'")
-        signals[name] = Signal(name, unit.removesuffix("]"), column.copy())
+        # A copy lies in one piece, and does not keep the whole table in memory.
+        signals[name] = Signal(name, unit, column.copy())
     return signals, status
 
 

@@ -9,7 +9,7 @@ import sys
 import sysconfig
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
@@ -74,6 +74,7 @@ def importing() -> Iterator[None]:
                 if path.exists() or path.with_suffix(".py").exists():
                     importlib.import_module(package)
         sys.path.extend(added)
+        # Python keeps lists of what its folders hold; a file may be new.
         importlib.invalidate_caches()
         try:
             yield
@@ -106,15 +107,14 @@ def load_plugin(
     if not TARGET.fullmatch(target):
         raise error(f"{what} must be given as module:Name, not '{target}'")
     module, _, attribute = target.partition(":")
-    foreign = module.partition(".")[0] not in OURS
+    foreign = not _is_ours(module)
     try:
         with importing():
             if foreign:
                 _forget_edited_modules()
             plugin: Any = importlib.import_module(module)
-            place = _place(module) if foreign else None
-            if place is not None and not _is_pythons(place):
-                _hash_when_loaded(place)
+            if foreign:
+                _remember_code(module)
         for part in attribute.split("."):
             plugin = getattr(plugin, part)
     # A module may raise anything while it is imported, and one that is a script may even exit.
@@ -125,15 +125,37 @@ def load_plugin(
     return plugin
 
 
+def _remember_code(module: str) -> None:
+    """Hash a loaded module's sources now: they may be edited while this process runs."""
+    place = _place(module)
+    if place is not None and not _is_pythons(place):
+        _hash_when_loaded(place)
+
+
 def exception_line(cause: BaseException) -> str:
     """The exception, its file and its line, as one line of text."""
-    words = str(cause) if isinstance(cause, ImportError) else f"{type(cause).__name__}: {cause}"
-    line = " ".join(words.split())
+    text = str(cause)
+    # Of a failed import the message says all.
+    if not isinstance(cause, ImportError):
+        text = f"{type(cause).__name__}: {text}"
+    line = " ".join(text.split())
     # The last frame that is neither Python's import nor this file.
-    for frame in reversed(traceback.extract_tb(cause.__traceback__)):
-        if not frame.filename.startswith("<frozen") and Path(frame.filename) != Path(__file__):
+    frames = traceback.extract_tb(cause.__traceback__)
+    for frame in reversed(frames):
+        is_importlib = frame.filename.startswith("<frozen")
+        if not is_importlib and Path(frame.filename) != Path(__file__):
             return f"{line} ({frame.filename}, line {frame.lineno})"
     return line
+
+
+def _top(module: str) -> str:
+    """The package of a module, or the module itself where it is in none."""
+    top, _, _ = module.partition(".")
+    return top
+
+
+def _is_ours(module: str) -> bool:
+    return _top(module) in OURS
 
 
 def code_of(module: str) -> str | None:
@@ -149,8 +171,8 @@ def code_of(module: str) -> str | None:
     Returns:
         The words; `UNKNOWN` of a module without a file; None of our own modules and of Python's.
     """
-    top = module.partition(".")[0]
-    if top in OURS or top in sys.builtin_module_names:
+    top = _top(module)
+    if _is_ours(module) or top in sys.builtin_module_names:
         return None
     place = _place(module)
     if place is None:
@@ -168,7 +190,11 @@ def code_of(module: str) -> str | None:
 @cache
 def _distributions() -> dict[str, list[str]]:
     """Installed distributions by the modules that they hold."""
-    return {module: sorted(set(names)) for module, names in packages_distributions().items()}
+    distributions = {}
+    for module, names in packages_distributions().items():
+        # A distribution stands there twice where two entries of sys.path lead to it.
+        distributions[module] = sorted(set(names))
+    return distributions
 
 
 def _place(module: str) -> Path | None:
@@ -177,16 +203,22 @@ def _place(module: str) -> Path | None:
     None of a module without a file, and of the script that runs, which was read at its start.
     """
     file = getattr(sys.modules.get(module), "__file__", None)
-    if module == "__main__" or not isinstance(file, str) or not Path(file).is_file():
+    if module == "__main__" or not isinstance(file, str):
         return None
     path = Path(file).absolute()
+    if not path.is_file():
+        return None
     # How many folders of packages the file is in.
-    depth = module.count(".") + (path.stem == "__init__")
+    depth = module.count(".")
+    if path.stem == "__init__":
+        depth += 1
     folder = path.parents[depth]
     if folder.name not in INSTALLED:
         return folder
     # Of an installed one the package alone: its folder holds all that is installed.
-    return path.parents[depth - 1] if depth else path
+    if depth == 0:
+        return path
+    return path.parents[depth - 1]
 
 
 def _is_installed(place: Path) -> bool:
@@ -227,8 +259,9 @@ def _users_places() -> list[tuple[Path, str]]:
 
 def _forget(place: Path) -> None:
     del _loaded[place]
+    # A list: the modules are removed meanwhile.
     for name in list(sys.modules):
-        if name.partition(".")[0] not in OURS and _place(name) == place:
+        if not _is_ours(name) and _place(name) == place:
             del sys.modules[name]
 
 
@@ -241,11 +274,15 @@ def _refuse_two_of_one_name(
     place = _place(module)
     if place is None:
         return
-    top = module.partition(".")[0]
-    for folder in map(Path, import_folders()):
-        is_there = (folder / f"{top}.py").is_file() or (folder / top / "__init__.py").is_file()
+    top = _top(module)
+    for name in import_folders():
+        folder = Path(name)
+        file = folder / f"{top}.py"
+        package = folder / top / "__init__.py"
+        if not file.is_file() and not package.is_file():
+            continue
         # A copy of the same sources does no harm.
-        if not is_there or folder.samefile(place) or _sources_hash(folder) == _sources_hash(place):
+        if folder.samefile(place) or _sources_hash(folder) == _sources_hash(place):
             continue
         raise error(
             f"{what}: two files have the name of its module, '{place / top}' and '{folder / top}'; "
@@ -256,12 +293,17 @@ def _refuse_two_of_one_name(
 def _sources_hash(place: Path) -> str:
     """First 16 hex digits of the SHA-256 of a place's Python files, with their names."""
     digest = hashlib.sha256()
-    files = [place] if place.is_file() else _python_files(place, set())
+    files: Iterable[Path] = [place]
+    if not place.is_file():
+        files = _python_files(place, set())
     for path in files:
+        # A file that cannot be read cannot be imported either.
         with suppress(OSError):
-            content = hashlib.sha256(path.read_bytes()).digest()
+            content = hashlib.sha256(path.read_bytes())
             name = path.relative_to(place).as_posix()
-            digest.update(f"{name}\0".encode(errors="surrogateescape") + content)
+            # Names of Linux may be no UTF-8; the null byte ends a name as nothing in it can.
+            digest.update(f"{name}\0".encode(errors="surrogateescape"))
+            digest.update(content.digest())
     return digest.hexdigest()[:16]
 
 
@@ -273,12 +315,16 @@ def _python_files(folder: Path, seen: set[Path]) -> Iterator[Path]:
         return
     seen.add(real)
     with suppress(OSError):
+        # Folders give their entries in any order.
         entries = sorted(folder.iterdir())
-        modules = [path for path in entries if path.name.endswith((".py", *EXTENSION_SUFFIXES))]
+        suffixes = (".py", *EXTENSION_SUFFIXES)
+        modules = [path for path in entries if path.name.endswith(suffixes)]
         # The first folder may hold packages alone.
         if not modules and len(seen) > 1:
             return
-        yield from (path for path in modules if path.is_file())
+        for path in modules:
+            if path.is_file():
+                yield path
         for path in entries:
             is_ours = folder == ROOT and path.name in OURS
             is_package = path.name.isidentifier() and path.name != "__pycache__"

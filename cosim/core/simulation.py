@@ -366,8 +366,7 @@ class _Run:
             return value
         numbers = int | float | np.integer | np.floating
         # To Python a truth is a number.
-        is_number = isinstance(value, numbers) and not isinstance(value, bool)
-        if not is_number:
+        if isinstance(value, bool) or not isinstance(value, numbers):
             # An array's text has several lines; a message is one.
             words = f"{value!r:.60}".split()
             one_line = " ".join(words)

@@ -357,7 +357,7 @@ class Trajectory(Result):
         """Rows of the CSV: each signal's value to the bit, and the status."""
         whole_kinds = {kind.name for kind in SIGNALS if kind.whole}
         whole_columns = []
-        columns = []
+        columns: list[Array] = []
         for name, signal in self.signals.items():
             if name in whole_kinds:
                 whole_columns.append(len(columns))

@@ -39,7 +39,15 @@ NonNegatives = Annotated[tuple[NonNegative, ...], Field(strict=False)]
 class Table(BaseModel):
     """A table whose fields are all known, checked strictly and never changed."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, populate_by_name=True)
+    model_config = ConfigDict(
+        # A scenario is shared by plants, controllers and caches, and has a hash.
+        frozen=True,
+        # A misspelt field would else leave its default in force without a word.
+        extra="forbid",
+        # No text becomes a number, and no fraction a whole one.
+        strict=True,
+        populate_by_name=True,
+    )
 
 
 class MappingTable(Table):
@@ -80,7 +88,8 @@ class ChangeTable(Table):
 
 def is_file(fmu: str) -> bool:
     """Whether an FMU is given by its path, and not by the name of a shipped one."""
-    return Path(fmu).suffix == ".fmu" or len(Path(fmu).parts) > 1
+    path = Path(fmu)
+    return path.suffix == ".fmu" or len(path.parts) > 1
 
 
 class PlantTable(Table):
@@ -277,35 +286,47 @@ class SignalTable(Table):
                 "the seconds that they last"
             )
         if self.times is not None:
-            if len(self.times) != len(self.values) or self.times[0] != 0:
-                raise ValueError(f"{where}: times must be one for each value, the first 0")
-            for time, next_time in pairwise((*self.times, self.length)):
-                if time >= next_time:
-                    raise ValueError(
-                        f"{where}: times must increase and end before its {self.length:g} s"
-                    )
-        roles = [self.model, self.bound, self.reference]
-        if sum(role is not None for role in roles) > 1:
+            self._check_times(self.times, where)
+        self._check_roles(where)
+        return self
+
+    def _check_times(self, times: tuple[float, ...], where: str) -> None:
+        """Raise ValueError where a value has no time of its own within the signal's length."""
+        if len(times) != len(self.values) or times[0] != 0:
+            raise ValueError(f"{where}: times must be one for each value, the first 0")
+        end = self.length
+        for time, next_time in pairwise((*times, end)):
+            if time >= next_time:
+                raise ValueError(f"{where}: times must increase and end before its {end:g} s")
+
+    def _check_roles(self, where: str) -> None:
+        """Raise ValueError where the signal moves nothing, or is several things at once."""
+        # What it is to the controller.
+        roles = (self.model, self.bound, self.reference)
+        n_roles = len(roles) - roles.count(None)
+        if n_roles > 1:
             raise ValueError(f"{where}: it can be one of model, bound and reference")
         if not any((self.plant, self.price_of, *roles)):
             raise ValueError(
                 f"{where}: it moves nothing; give plant, price_of, model, bound or reference"
             )
-        if self.known != "none" and not any(roles):
+        # A controller cannot use a number of which nothing says what it is.
+        if self.known != "none" and n_roles == 0:
             raise ValueError(
                 f"{where}: known = '{self.known}' needs model, bound or reference: what it is to "
                 "the controller"
             )
         if self.ahead is not None and self.known != "preview":
             raise ValueError(f"{where}: ahead needs known = 'preview'")
-        return self
 
     def _check_measurement(self, where: str) -> None:
         """Raise ValueError where a measured disturbance is more than that."""
+        # Its values are the plant's, and it moves nothing there.
         fields = ("values", "times", "period", "once", "plant", "price_of", "bound", "reference")
         for field in fields:
             if getattr(self, field):
                 raise ValueError(f"{where}: it measures a disturbance, so it can have no {field}")
+        # Measured for nobody it would only cost the plant a run beforehand.
         if self.model is None or self.known == "none":
             raise ValueError(f"{where}: what it measures needs model, and known: now or preview")
 
@@ -319,7 +340,10 @@ class SignalTable(Table):
     @property
     def bounded_state(self) -> str:
         """Name of the state whose bound it is; empty where it is none."""
-        return "" if self.bound is None else self.bound[4:-1]
+        if self.bound is None:
+            return ""
+        # The field's pattern gives it the form x_l[NAME] or x_u[NAME].
+        return self.bound[len("x_l[") : -len("]")]
 
     @property
     def is_lower_bound(self) -> bool:
@@ -356,7 +380,9 @@ def _array(field: str) -> cached_property[NDArray[np.float64]]:
     """A field of the document, by its dotted name, as a read-only array."""
 
     def array(scenario: Scenario) -> NDArray[np.float64]:
-        values = np.array(attrgetter(field)(scenario), dtype=np.float64)
+        entries = attrgetter(field)(scenario)
+        values = np.array(entries, dtype=np.float64)
+        # Everybody who asks is given the same array.
         values.flags.writeable = False
         return values
 
@@ -396,7 +422,8 @@ class Penalty:
         self.quadratic = np.asarray(quadratic, dtype=float)
         # Python's numbers: for a few states they are faster than arrays.
         columns = np.array([self.lower, self.upper, self.linear, self.quadratic])
-        self._rows = [(i, *row) for i, row in enumerate(columns.T.tolist())]
+        rows = columns.T.tolist()
+        self._rows = [(i, *row) for i, row in enumerate(rows)]
 
     def __call__(self, state: Sequence[float] | NDArray[np.float64]) -> float:
         """Penalty of one state (n,), fastest for a list; a NaN state gives NaN."""
@@ -476,16 +503,20 @@ class Scenario(Shown, Table):
         self._check_sensors()
         self._check_signals()
         plant = self.plant
-        law = self.disturbance.law
         names = (*plant.states, *plant.actions, *plant.disturbances)
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(
                     f"plant: names '{name}' twice among states, actions and disturbances"
                 )
-        if law != "none" and not (plant.mapping.law and law in plant.mapping.law_codes):
+        # An FMU draws by itself: a law that cannot be written to it would not be in force.
+        law = self.disturbance.law
+        mapping = plant.mapping
+        is_mapped = mapping.law and law in mapping.law_codes
+        if law != "none" and not is_mapped:
             raise ValueError(f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes")
-        if any(self.disturbance.time_constant or ()) and not plant.mapping.time_constant:
+        constants = self.disturbance.time_constant or ()
+        if any(constants) and not mapping.time_constant:
             raise ValueError(
                 "disturbance.time_constant: needs plant.mapping.time_constant, a parameter of the "
                 "FMU for each disturbance"
@@ -522,13 +553,16 @@ class Scenario(Shown, Table):
             "disturbance": len(self.plant.disturbances),
         }
         for field, kind, optional in rules:
-            entries = len(attrgetter(field)(self) or ())
-            if entries == sizes[kind] or (optional and not entries):
+            values = attrgetter(field)(self) or ()
+            entries = len(values)
+            size = sizes[kind]
+            if entries == 0 and optional:
                 continue
-            raise ValueError(
-                f"{field}: must have one entry per {kind} (plant.{kind}s has {sizes[kind]}), "
-                f"not {entries}"
-            )
+            if entries != size:
+                raise ValueError(
+                    f"{field}: must have one entry per {kind} (plant.{kind}s has {size}), "
+                    f"not {entries}"
+                )
 
     def _check_bounds(self) -> None:
         """Raise ValueError where a lower bound is not below the upper one."""
@@ -542,8 +576,10 @@ class Scenario(Shown, Table):
         """Raise ValueError where steps, start and stop, or the changes do not fit."""
         plant = self.plant
         # Within rounding: 0.3 s in steps of 0.1 s are 2.9999999999999996.
-        steps = self.sampling_time / (plant.communication_step or self.sampling_time)
-        if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
+        communication_step = plant.communication_step or self.sampling_time
+        steps = self.sampling_time / communication_step
+        whole_steps = round(steps)
+        if whole_steps < 1 or abs(steps - whole_steps) > 1e-9 * steps:
             raise ValueError("plant.communication_step: must be a divisor of sampling_time")
         start = plant.start_time
         stop = plant.stop_time
@@ -580,61 +616,72 @@ class Scenario(Shown, Table):
             for target in targets:
                 if target is not None and targets.count(target) > 1:
                     raise ValueError(f"signal: two of them have the {field} '{target}'")
-        plant = self.plant
-        changed: set[str] = set()
-        for change in plant.changes or ():
-            changed |= change.parameters.keys()
         for signal in signals:
-            where = f"signal '{signal.name}'"
-            measured = signal.measures
-            if measured is not None and measured not in plant.disturbances:
-                raise ValueError(
-                    f"{where}: it measures '{measured}', which is none of plant.disturbances"
-                    f"{instead(measured, plant.disturbances)}"
-                )
-            if signal.plant in plant.actions:
-                raise ValueError(f"{where}: plant '{signal.plant}' is an action")
-            if signal.plant in changed:
-                raise ValueError(f"{where}: plant '{signal.plant}' is set by plant.changes too")
-            state = signal.bounded_state
-            if state and state not in plant.states:
-                raise ValueError(
-                    f"{where}: bound '{signal.bound}' is of no state{instead(state, plant.states)}"
-                )
-            names = (*plant.states, *plant.actions)
-            if signal.reference is not None and signal.reference not in names:
-                raise ValueError(
-                    f"{where}: reference '{signal.reference}' is no state or action"
-                    f"{instead(signal.reference, names)}"
-                )
+            self._check_signal(signal, f"signal '{signal.name}'")
         self._check_moving_bounds()
-        is_filtered = self.sensors and (self.estimator or EstimatorTable()).kind == "ekf"
+        estimator = self.estimator or EstimatorTable()
+        is_filtered = self.sensors and estimator.kind == "ekf"
         for signal in signals:
-            if is_filtered and signal.model is not None and signal.known != "none":
+            is_informed = signal.model is not None and signal.known != "none"
+            # The filter would take the model's nominal value, and its estimate be wrong.
+            if is_filtered and is_informed:
                 raise ValueError(
                     f"signal '{signal.name}': the estimator 'ekf' does not know of a signal of the "
                     "model; name another estimator.kind"
                 )
 
+    def _check_signal(self, signal: SignalTable, where: str) -> None:
+        """Raise ValueError where one signal does not fit the plant."""
+        plant = self.plant
+        measured = signal.measures
+        if measured is not None and measured not in plant.disturbances:
+            raise ValueError(
+                f"{where}: it measures '{measured}', which is none of plant.disturbances"
+                f"{instead(measured, plant.disturbances)}"
+            )
+        # One variable of the FMU has one writer: the last one would win without a word.
+        if signal.plant in plant.actions:
+            raise ValueError(f"{where}: plant '{signal.plant}' is an action")
+        for change in plant.changes or ():
+            if signal.plant in change.parameters:
+                raise ValueError(f"{where}: plant '{signal.plant}' is set by plant.changes too")
+        state = signal.bounded_state
+        if state and state not in plant.states:
+            raise ValueError(
+                f"{where}: bound '{signal.bound}' is of no state{instead(state, plant.states)}"
+            )
+        names = (*plant.states, *plant.actions)
+        if signal.reference is not None and signal.reference not in names:
+            raise ValueError(
+                f"{where}: reference '{signal.reference}' is no state or action"
+                f"{instead(signal.reference, names)}"
+            )
+
     def _check_moving_bounds(self) -> None:
         """Raise ValueError where a moving bound may come to its counterpart."""
-        highest = dict(zip(self.plant.states, self.bounds.state_lower, strict=True))
-        lowest = dict(zip(self.plant.states, self.bounds.state_upper, strict=True))
+        # Of each state the highest lower bound, and the lowest upper one, of any sample: two
+        # signals may have any phase to each other.
+        states = self.plant.states
+        highest = dict(zip(states, self.bounds.state_lower, strict=True))
+        lowest = dict(zip(states, self.bounds.state_upper, strict=True))
         for signal in self.signals or ():
             if signal.is_lower_bound:
                 highest[signal.bounded_state] = max(signal.values)
             elif signal.bound is not None:
                 lowest[signal.bounded_state] = min(signal.values)
-        for name in self.plant.states:
+        for name in states:
+            lower = highest[name]
+            upper = lowest[name]
             # Where nothing moves this has been checked.
-            if not highest[name] < lowest[name]:
+            if not lower < upper:
                 raise ValueError(
-                    f"signal: the lower bound of '{name}' comes up to {highest[name]:g}, and its "
-                    f"upper bound down to {lowest[name]:g}"
+                    f"signal: the lower bound of '{name}' comes up to {lower:g}, and its "
+                    f"upper bound down to {upper:g}"
                 )
 
     def _facts(self) -> dict[str, object]:
         plant = self.plant
+        disturbances = ", ".join(plant.disturbances)
         return {
             "name": self.name,
             "hash": self.hash,
@@ -642,7 +689,7 @@ class Scenario(Shown, Table):
             "fmu": plant.fmu,
             "states": ", ".join(plant.states),
             "actions": ", ".join(plant.actions),
-            "disturbances": f"{', '.join(plant.disturbances)} ({self._law()})",
+            "disturbances": f"{disturbances} ({self._law()})",
         }
 
     def _law(self) -> str:
@@ -682,7 +729,8 @@ class Scenario(Shown, Table):
 
         Tables are merged, everything else is replaced; the result is validated as a whole.
         """
-        return self.from_dict(merged(self.to_dict(), changes), f"scenario '{self.name}'")
+        document = merged(self.to_dict(), changes)
+        return self.from_dict(document, f"scenario '{self.name}'")
 
     def at(self, time: float) -> Scenario:
         """The scenario of the plant as it is at a time in s, with no further change to come.
@@ -701,7 +749,10 @@ class Scenario(Shown, Table):
         """Return the document that this scenario was validated from, every default written out."""
         document: dict[str, Any] = self.model_dump(mode="json", by_alias=True, exclude_none=True)
         # JSON has no infinity: bounds are taken as they are.
-        document["bounds"] = {key: list(value) for key, value in self.bounds}
+        bounds = {}
+        for field, values in self.bounds:
+            bounds[field] = list(values)
+        document["bounds"] = bounds
         return document
 
     def to_toml(self) -> str:
@@ -716,15 +767,19 @@ class Scenario(Shown, Table):
         constants that are all zero are none.
         """
         document = self.to_dict()
+        plant = document["plant"]
         del document["name"]
         del document["description"]
-        document["plant"]["fmu"] = Path(self.plant.fmu).name
-        if not any(self.disturbance.time_constant or ()):
+        plant["fmu"] = Path(self.plant.fmu).name
+        # Scenarios from before there were time constants keep their hash.
+        constants = self.disturbance.time_constant or ()
+        if not any(constants):
             document["disturbance"].pop("time_constant", None)
-            document["plant"]["mapping"].pop("time_constant", None)
+            plant["mapping"].pop("time_constant", None)
         # One text for one content, whatever the order of a file's keys.
         canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+        digest = hashlib.sha256(canonical.encode())
+        return digest.hexdigest()[:16]
 
     initial_state = _array("plant.initial_state")
     """State at k = 0, (n,)."""
@@ -748,7 +803,8 @@ class Scenario(Shown, Table):
     @property
     def measurement_names(self) -> tuple[str, ...]:
         """Names of the sensors' signals, `measured[X2]` say; none without sensors."""
-        return tuple(f"measured[{sensor.variable}]" for sensor in self.sensors or ())
+        sensors = self.sensors or ()
+        return tuple(f"measured[{sensor.variable}]" for sensor in sensors)
 
     @property
     def estimate_names(self) -> tuple[str, ...]:
@@ -765,7 +821,8 @@ class Scenario(Shown, Table):
     @property
     def valued_signals(self) -> tuple[SignalTable, ...]:
         """The signals that have values, and are no measured disturbance."""
-        return tuple(signal for signal in self.signals or () if signal.measures is None)
+        signals = self.signals or ()
+        return tuple(signal for signal in signals if signal.measures is None)
 
     @property
     def priced(self) -> tuple[str, ...]:
@@ -778,6 +835,7 @@ class Scenario(Shown, Table):
         """The scenario without its signals; itself where it has none."""
         if self.signals is None:
             return self
+        # Validated as a whole, as every scenario is.
         document = self.to_dict()
         del document["signal"]
         return Scenario.from_dict(document)
@@ -796,7 +854,10 @@ class Scenario(Shown, Table):
     def state_penalty(self) -> Penalty:
         """Penalty of a state beyond the bounds."""
         return Penalty(
-            self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
+            self.state_lower,
+            self.state_upper,
+            self.penalty_linear,
+            self.penalty_quadratic,
         )
 
     @property
@@ -805,7 +866,8 @@ class Scenario(Shown, Table):
         table = self.disturbance
         if not table.coloured:
             return 0.0
-        return max(table.time_constant or ()) / self.sampling_time
+        longest = max(table.time_constant or ())
+        return longest / self.sampling_time
 
     def saturate(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """Actions (…, m) clipped to the actuators' bounds."""
@@ -818,7 +880,8 @@ PRESETS = Path(__file__).parents[1] / "presets"
 
 def presets() -> list[str]:
     """Names of the scenarios that the package ships."""
-    return sorted(path.stem for path in PRESETS.glob("*.toml"))
+    files = PRESETS.glob("*.toml")
+    return sorted(file.stem for file in files)
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -831,8 +894,10 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     result = dict(base)
     for key, value in changes.items():
         old = result.get(key)
-        both_tables = isinstance(value, Mapping) and isinstance(old, Mapping)
-        result[key] = merged(old, value) if both_tables else value  # type: ignore[arg-type]
+        if isinstance(value, Mapping) and isinstance(old, Mapping):
+            result[key] = merged(old, value)
+        else:
+            result[key] = value
     return result
 
 
@@ -859,20 +924,25 @@ def random_plant(seed: int) -> dict[str, Any]:
     disturbances by ±5 %; the law, uniform or normal; the disturbances' standard deviations by a
     factor of 0.5 … 2, common to all, log-uniform.
     """
+    # The order of the draws is part of what a seed means: stored results name these plants.
     rng = np.random.default_rng(seed)
     paper, _ = read("paper")
     sampling_time = float(rng.choice([30.0, 60.0, 120.0]))
     parameters = {}
     for name, value, low, high in RANDOM_PARAMETERS:
-        parameters[name] = _four_digits(value * rng.uniform(low, high))
+        factor = rng.uniform(low, high)
+        parameters[name] = _four_digits(value * factor)
     law = paper["disturbance"]
-    nominal = [_four_digits(value * rng.uniform(0.95, 1.05)) for value in law["nominal"]]
+    nominal = []
+    for value in law["nominal"]:
+        factor = rng.uniform(0.95, 1.05)
+        nominal.append(_four_digits(value * factor))
     kind = str(rng.choice(["uniform", "normal"]))
-    factor = 2.0 ** rng.uniform(-1.0, 1.0)
+    spread = 2.0 ** rng.uniform(-1.0, 1.0)
     # A uniform law of half width r has the standard deviation r/√3.
     if kind == "normal":
-        factor /= math.sqrt(3.0)
-    ranges = [_four_digits(value * factor) for value in law["ranges"]]
+        spread /= math.sqrt(3.0)
+    ranges = [_four_digits(value * spread) for value in law["ranges"]]
     return {
         "name": f"random-{seed}",
         "description": f"The evaporator with the random errors that seed {seed} draws; the "
@@ -903,14 +973,19 @@ def random_coloured_plant(seed: int) -> dict[str, Any]:
     time_constants = []
     for _ in disturbance["nominal"]:
         has_memory = rng.uniform() < 0.75
+        # Drawn in any case, so that the next one's draw does not hang on this one.
         seconds = 60.0 * 20.0 ** rng.uniform()
         time_constants.append(_four_digits(seconds) if has_memory else 0.0)
     ranges = [_four_digits(COLOURED_SPREAD * value) for value in disturbance["ranges"]]
+    changed = {
+        "ranges": ranges,
+        "time_constant": time_constants,
+    }
     return plant | {
         "name": f"random-coloured-{seed}",
         "description": f"The evaporator with the random errors and the time constants of its "
         f"disturbances that seed {seed} draws; the controller is not told",
-        "disturbance": disturbance | {"ranges": ranges, "time_constant": time_constants},
+        "disturbance": disturbance | changed,
     }
 
 
@@ -938,11 +1013,13 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
         )
     random = RANDOM.fullmatch(str(source))
     if random is not None:
+        coloured, digits = random.groups()
         paper, _ = read("paper")
-        draw = random_coloured_plant if random[1] else random_plant
-        return paper | draw(int(random[2])), f"preset '{source}'"
+        draw = random_coloured_plant if coloured else random_plant
+        return paper | draw(int(digits)), f"preset '{source}'"
     path = Path(source)
     origin = f"scenario file '{source}'"
+    # A preset's name comes before a file of the same name.
     if str(source) in presets():
         path = PRESETS / f"{source}.toml"
         origin = f"preset '{source}'"
@@ -954,10 +1031,12 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
         )
     document = read_toml(path, origin, ScenarioError)
     place = path.resolve()
+    folder = place.parent
     # A file's `module:factory` may lie beside it.
     if path.parent != PRESETS:
-        import_from(place.parent)
-    return resolved(document, origin, place.parent, (*seen, str(place))), origin
+        import_from(folder)
+    whole = resolved(document, origin, folder, (*seen, str(place)))
+    return whole, origin
 
 
 def resolved(
@@ -985,20 +1064,24 @@ def resolved(
         if isinstance(fmu, str) and is_file(fmu):
             plant["fmu"] = str(folder / fmu)
     signals = result.get("signal")
-    for signal in signals if isinstance(signals, list) else ():
-        if isinstance(signal, dict) and isinstance(signal.get("file"), str):
-            signal["file"] = str(folder / signal["file"])
+    if isinstance(signals, list):
+        for signal in signals:
+            file = signal.get("file") if isinstance(signal, dict) else None
+            if isinstance(file, str):
+                signal["file"] = str(folder / file)
     base = result.pop("extends", None)
     if base is None:
         return result
     if not isinstance(base, str):
         raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
-    if base not in presets() and not RANDOM.fullmatch(base):
+    is_named = base in presets() or RANDOM.fullmatch(base)
+    if not is_named:
         base = str(folder / base)
     # The system's calls take no such path.
     if "\0" in base:
         raise ScenarioError(f"{origin}: extends must not hold a null byte")
-    if str(Path(base).resolve()) in seen:
+    place = str(Path(base).resolve())
+    if place in seen:
         raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
     # Depth first: the base has been resolved as seen from its own folder.
     base_document, _ = read(base, seen)

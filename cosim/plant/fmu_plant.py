@@ -24,6 +24,7 @@ from cosim.plant.wiring import Wiring, refusals, seed_words
 
 _NOT_STARTED = -1
 _HEADER = struct.Struct("<q32s")
+"""Before a serialised state: the sample's number, and the SHA-256 of the FMU."""
 
 
 @dataclass(eq=False, slots=True)
@@ -77,46 +78,52 @@ class FmuPlant:
         fmu: str | Path | None = None,
         intermediate: Intermediate | None = None,
     ) -> None:
-        self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+        if not isinstance(scenario, Scenario):
+            scenario = Scenario.load(scenario)
+        self.scenario = scenario
+        plant = scenario.plant
+        # Before what may fail: `close` looks at them.
         self._fmi: Instance | None = None
         self._handles: list[ctypes.c_void_p] = []
         self._free_handles: list[ctypes.c_void_p] = []
-        archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
-        self._h = self.scenario.sampling_time
-        step = self.scenario.plant.communication_step or self._h
+        self._h = scenario.sampling_time
+        step = plant.communication_step or self._h
+        self._steps = round(self._h / step)
+        archive = unpack(plant.fmu if fmu is None else fmu)
         # The first reason suffices: the others may follow from it.
         for refusal in refusals(archive, step):
             raise PlantError(refusal)
-        wiring = Wiring(self.scenario, archive)
+        wiring = Wiring(scenario, archive)
+        self._wiring = wiring
+        self._seeds = wiring.seeds
+        self._initial = wiring.initial
+        self._intermediate = intermediate
         self.unpacked = archive
         self.fmi_version = str(archive.description.fmiVersion)
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
-        plant = self.scenario.plant
-        self.units = _units(self.scenario, archive)
-        sensors = self.scenario.sensors
-        self._sensors = Sensors(sensors) if sensors else None
-        self._signals = signals_of(self.scenario)
-        self.y: Array | None = None
+        self.units = _units(scenario, archive)
         ranges = np.array([archive.range(name) for name in plant.states])
         self.state_range = ranges[:, 0], ranges[:, 1]
-        self.penalty = self.scenario.state_penalty
-        self._seeds = wiring.seeds
-        self._initial = wiring.initial
+        self.penalty = scenario.state_penalty
+        sensors = scenario.sensors
+        self._sensors = Sensors(sensors) if sensors else None
+        self._signals = signals_of(scenario)
+        self.y: Array | None = None
+        self._n = len(plant.states)
+        self._m = len(plant.actions)
         # The initial state that the FMU was given last.
         self._asked = list(plant.initial_state)
         self._elsewhere = False
-        self._n = len(plant.states)
-        self._m = len(plant.actions)
         self._k = _NOT_STARTED
         self._started = False
+        # Whether snapshots have been proven.
         self._saves = False
+        # Penalty of the present state, which the next step returns.
         self._penalty_now = 0.0
-        self._steps = round(self._h / step)
-        self._wiring = wiring
-        self._intermediate = intermediate
         # What the FMU was seen to do decides, not what its description says.
-        self._probe = probe_of(subject_of(self.scenario, archive, wiring))
+        subject = subject_of(scenario, archive, wiring)
+        self._probe = probe_of(subject)
         self._reading = self._probe.reading
         # Where a probe cannot tell, the scenario may say which instant an output belongs to.
         if plant.outputs is not None:
@@ -126,8 +133,9 @@ class FmuPlant:
             self.require_cost_of_sample()
         if self._probe.misfit:
             raise PlantError(self._probe.misfit)
-        self._resets = self._probe.findings.restart is Restart.RESET
-        self._start_time = self._probe.findings.experiment.start_time
+        findings = self._probe.findings
+        self._resets = findings.restart is Restart.RESET
+        self._start_time = findings.experiment.start_time
         self._instantiate()
 
     def require_cost_of_sample(self) -> None:
@@ -147,16 +155,20 @@ class FmuPlant:
     def _instantiate(self) -> None:
         """Make an instance of the FMU, and look up what a step uses of it."""
         wiring = self._wiring
-        fmi = self._fmi = wiring.interface(
+        # The sensors' variables are read with the states, behind these.
+        states = [*wiring.states, *wiring.sensors]
+        intermediate = None if self._intermediate is None else self._since_reset
+        fmi = wiring.interface(
             self.unpacked,
-            # The sensors' variables are read with the states, behind these.
-            (wiring.inputs, wiring.outputs, [*wiring.states, *wiring.sensors]),
+            (wiring.inputs, wiring.outputs, states),
             wiring.starts,
             self._h / self._steps,
             self._reading,
             self._probe.findings.experiment,
-            self._intermediate and self._since_reset,
+            intermediate,
         )
+        self._fmi = fmi
+        # Compiled code takes one FMI step a sample, and knows no sensors and signals.
         in_one_step = self._steps == 1 and self._intermediate is None
         bare = self._sensors is None and self._signals is None
         self.drivable = fmi.drivable and in_one_step and bare
@@ -165,7 +177,9 @@ class FmuPlant:
         for k, (places, values) in wiring.changes().items():
             self._changes[k] = fmi.writer(places, values)
         # Bound once: a step looks nothing up that stays the same.
-        self._advance = fmi.advance if self._steps == 1 else self._advance_in_steps
+        self._advance = fmi.advance
+        if self._steps > 1:
+            self._advance = self._advance_in_steps
         self._inputs = fmi.inputs
         self._outputs = fmi.outputs
         self._exchanged = fmi.states
@@ -220,17 +234,21 @@ class FmuPlant:
             fmi = self._begin_anew()
         for place, word in words:
             fmi.change_start(place, word)
+        # The FMU keeps its start values: those of another episode have to be put back.
         if initial_state is not None or self._elsewhere:
             self._start_from(fmi, initial_state)
+        # An FMU that fails now is before any episode.
         self._k = _NOT_STARTED
         fmi.initialise(self._started)
+        # Equal to the bit in most cases, which spares the look at each of them.
         if self._initial and self._states != self._asked:
             self._check_initial_state()
         self._started = True
         self._k = 0
         self._penalty_now = self.penalty(self._states)
         if self._sensors is not None:
-            self.y = self._sensors.start(operator.index(seed), self._exchanged[self._n :])
+            sensed = self._exchanged[self._n :]
+            self.y = self._sensors.start(operator.index(seed), sensed)
         return self._copy_states()
 
     def _begin_anew(self) -> Instance:
@@ -315,7 +333,8 @@ class FmuPlant:
         """Cost of what signals are the prices of, as it was read in the last step."""
         first = 1 + len(self.scenario.plant.disturbances)
         quantities: list[float] = self._outputs[first:]
-        return sum(price * quantity for price, quantity in zip(prices, quantities, strict=True))
+        pairs = zip(prices, quantities, strict=True)
+        return sum(price * quantity for price, quantity in pairs)
 
     def _advance_in_steps(self, time: float) -> None:
         """Step through a sample; the outputs are those of its first step."""
@@ -324,7 +343,9 @@ class FmuPlant:
         # Stage cost and disturbance are those of the sample's begin.
         outputs = self._outputs[:]
         for i in range(1, self._steps):
-            fmi.advance(time + i * self._h / self._steps)
+            # Multiples of the step, never sums of it, in which rounding would add up.
+            since_begin = i * self._h / self._steps
+            fmi.advance(time + since_begin)
         self._outputs[:] = outputs
 
     def drive(self, loop: CompiledLoop, table: Array) -> Array:
@@ -344,6 +365,7 @@ class FmuPlant:
         first = self._k
         end = first + len(table)
         k = first
+        # Until all samples are done, as in `step`.
         self._k = _NOT_STARTED
         while k < end:
             if k in self._changes:
@@ -353,7 +375,8 @@ class FmuPlant:
             for change in self._changes:
                 if k < change < stop:
                     stop = change
-            k, fault, status = loop(fmi.native, k, table[k - first : stop - first])
+            rows = table[k - first : stop - first]
+            k, fault, status = loop(fmi.native, k, rows)
             if fault == NOT_FINITE_STATUS:
                 self._refuse_output(k)
             if fault:
@@ -377,12 +400,15 @@ class FmuPlant:
 
     def restore(self, snapshot: Snapshot) -> Array:
         """Go back to a snapshot; return its state (n,). Raises PlantError on another plant's."""
-        self._require_own(snapshot).load(snapshot.handle)
+        fmi = self._require_own(snapshot)
+        fmi.load(snapshot.handle)
         self._k = snapshot.k
         self._penalty_now = self.penalty(self._states)
         if self._sensors is not None and snapshot.sensors is not None:
             self._sensors.restore(snapshot.sensors)
-            self.y = self._sensors.read(self._k, self._exchanged[self._n :])
+            # The reading is a function of the values and the sample: once more it is the same.
+            sensed = self._exchanged[self._n :]
+            self.y = self._sensors.read(self._k, sensed)
         return self._copy_states()
 
     def serialise(self, snapshot: Snapshot) -> bytes:
@@ -391,10 +417,12 @@ class FmuPlant:
         fmi.require_serialised_state()
         self._require_proof(self._probe.serialises, "serialise")
         state = fmi.serialise(snapshot.handle)
-        header = _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256))
+        digest = bytes.fromhex(self.fmu_sha256)
+        header = _HEADER.pack(snapshot.k, digest)
         if self._sensors is None or snapshot.sensors is None:
             return header + state
-        return header + self._sensors.to_bytes(snapshot.sensors) + state
+        sensors = self._sensors.to_bytes(snapshot.sensors)
+        return header + sensors + state
 
     def deserialise(self, data: bytes) -> Snapshot:
         """A snapshot from its bytes; raises PlantError where they are not of the same FMU file."""
@@ -450,9 +478,13 @@ class FmuPlant:
             instance: of which it is.
             handle: the memory.
         """
-        if instance is self._fmi:
-            self._free_handles.append(handle)
-            instance.no_return.value = len(self._free_handles) == len(self._handles)
+        # An instance that has been closed has freed it.
+        if instance is not self._fmi:
+            return
+        self._free_handles.append(handle)
+        # Without a snapshot left nothing takes the FMU back, and it may forget its past.
+        nothing_is_kept = len(self._free_handles) == len(self._handles)
+        instance.no_return.value = nothing_is_kept
 
     def close(self) -> None:
         """Free the FMU instance and every snapshot; a closed plant refuses all calls."""
@@ -495,12 +527,12 @@ class FmuPlant:
                 f"scenario '{self.scenario.name}' names no plant.mapping.initial_state: its plant "
                 "always starts where the FMU does"
             )
-        values = np.asarray(table.initial_state if state is None else state, dtype=float)
-        if values.shape != (len(table.states),) or not np.isfinite(values).all():
+        asked = table.initial_state if state is None else state
+        values = np.asarray(asked, dtype=float)
+        n = len(table.states)
+        if values.shape != (n,) or not np.isfinite(values).all():
             names = ", ".join(table.states)
-            raise PlantError(
-                f"initial_state must be {len(table.states)} finite numbers ({names}), not {state}"
-            )
+            raise PlantError(f"initial_state must be {n} finite numbers ({names}), not {state}")
         self._asked = values.tolist()
         for place, value in zip(self._initial, self._asked, strict=True):
             fmi.change_start(place, value)
@@ -509,10 +541,17 @@ class FmuPlant:
     def _refuse_output(self, k: int) -> NoReturn:
         """Raise PlantError with the variables that are no finite numbers."""
         table = self.scenario.plant
-        sensed = [sensor.variable for sensor in self.scenario.sensors or ()]
+        sensors = self.scenario.sensors or ()
         values = {table.stage_cost: self._outputs[0]}
-        values |= dict(zip((*table.states, *sensed), self._exchanged, strict=True))
-        bad = [f"{name} = {value}" for name, value in values.items() if not isfinite(value)]
+        # In the order in which they are exchanged: states, then what sensors read.
+        exchanged_names = list(table.states)
+        for sensor in sensors:
+            exchanged_names.append(sensor.variable)
+        values |= dict(zip(exchanged_names, self._exchanged, strict=True))
+        bad = []
+        for name, value in values.items():
+            if not isfinite(value):
+                bad.append(f"{name} = {value}")
         raise PlantError(f"FMU '{self.fmu_path.name}' returned {', '.join(bad)} at step {k}")
 
 
@@ -520,16 +559,28 @@ def _units(scenario: Scenario, archive: UnpackedFmu) -> dict[str, str]:
     """Units of a scenario's variables, readings, estimates and signals, by name."""
     plant = scenario.plant
     sensors = scenario.sensors or ()
-    sensed = [sensor.variable for sensor in sensors]
-    names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost, *sensed)
-    units = {name: archive.unit(name) for name in names}
+    # Of each name in records the FMU's variable whose unit it has.
+    variables: dict[str, str] = {}
+    own_names = (
+        *plant.states,
+        *plant.actions,
+        *plant.disturbances,
+        plant.stage_cost,
+    )
+    for name in own_names:
+        variables[name] = name
+    for sensor in sensors:
+        variables[sensor.variable] = sensor.variable
     # A measurement and an estimate have the unit of what they are of.
-    for name, variable in zip(scenario.measurement_names, sensed, strict=True):
-        units[name] = units[variable]
+    for name, sensor in zip(scenario.measurement_names, sensors, strict=True):
+        variables[name] = sensor.variable
+    # Without sensors there are no estimates.
     for name, state in zip(scenario.estimate_names, plant.states, strict=False):
-        units[name] = units[state]
+        variables[name] = state
+    # A signal has that of what it drives, or is; a price has none.
     for signal, name in zip(scenario.valued_signals, scenario.signal_names, strict=True):
-        # That of what it drives, or is; a price has none.
-        target = signal.plant or signal.bounded_state or signal.reference
-        units[name] = archive.unit(target) if target else ""
+        variables[name] = signal.plant or signal.bounded_state or signal.reference or ""
+    units = {}
+    for name, variable in variables.items():
+        units[name] = archive.unit(variable) if variable else ""
     return units

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -57,10 +58,14 @@ class PlantCheck:
         }
         if self.report is not None:
             report = self.report
+            kinds = {}
+            for name, kind in report.kinds.items():
+                # The enumeration's name: its value is a sentence for the table.
+                kinds[name] = kind.name.lower()
             document |= {
                 "sha256": report.sha256,
                 "outputs": report.outputs,
-                "kinds": {name: kind.name.lower() for name, kind in report.kinds.items()},
+                "kinds": kinds,
                 "restart": report.restart.name.lower(),
                 "snapshots": report.snapshots,
                 "serialises": report.serialises,
@@ -94,7 +99,8 @@ def check_plant(
     Raises:
         CosimError: The file is missing or is no FMU, or a name is not one of its variables.
     """
-    path = (fmus.path(str(fmu)) if str(fmu) in SHIPPED_FMUS else Path(fmu)).absolute()
+    path = fmus.path(str(fmu)) if str(fmu) in SHIPPED_FMUS else Path(fmu)
+    path = path.absolute()
     _require_fmu(path)
     # From here on an FMU that cannot be a plant is an answer, and no error.
     try:
@@ -114,6 +120,7 @@ def check_plant(
     document, roles = _document(path, archive, states, actions, stage_cost, sampling_time)
     rows.append(roles)
     rows.append(_step_size(archive, document["sampling_time"]))
+    # Row by row: a refusal shows what was found before it.
     try:
         scenario = Scenario.from_dict(document)
         report = probe(scenario)
@@ -122,7 +129,14 @@ def check_plant(
         rows.append(_run_row(scenario))
     except CosimError as error:
         return refused(str(error))
-    return PlantCheck(path, True, _verdict(report), tuple(rows), remarks, report)
+    return PlantCheck(
+        fmu=path,
+        usable=True,
+        verdict=_verdict(report),
+        rows=tuple(rows),
+        remarks=remarks,
+        report=report,
+    )
 
 
 def _require_fmu(path: Path) -> None:
@@ -139,22 +153,28 @@ def _require_fmu(path: Path) -> None:
 
 
 def _interfaces(about: dict[str, Any]) -> Row:
-    words = f"FMI {about['fmi_version']}: {', '.join(about['interfaces']) or 'none'}"
-    used = "co-simulation is used" if "co-simulation" in about["interfaces"] else ""
-    return Row("interfaces", words, used)
+    interfaces = about["interfaces"]
+    words = ", ".join(interfaces) or "none"
+    used = "co-simulation is used" if "co-simulation" in interfaces else ""
+    return Row("interfaces", f"FMI {about['fmi_version']}: {words}", used)
 
 
 def _platforms(about: dict[str, Any]) -> Row:
     words = []
     for folder, made_for in about["platforms"].items():
-        words.append(f"{folder} ({', '.join(made_for)})" if made_for else folder)
+        # What a file is made for is read from its own bytes: a folder's name may be wrong.
+        if made_for:
+            words.append(f"{folder} ({', '.join(made_for)})")
+        else:
+            words.append(folder)
     return Row("platforms", ", ".join(words) or "none", "")
 
 
 def _description(remarks: Sequence[str]) -> Row:
     if not remarks:
         return Row("model description", "no flaw was found", "")
-    count = f"{len(remarks)} remark{'s' if len(remarks) > 1 else ''}, listed below"
+    noun = "remarks" if len(remarks) > 1 else "remark"
+    count = f"{len(remarks)} {noun}, listed below"
     return Row("model description", count, "other tools may mind; the plant does not")
 
 
@@ -181,32 +201,46 @@ def _document(
                 raise
         roles = number_roles(archive, states, actions, stage_cost)
         consequence = str(error)
-    stated = number(getattr(archive.description.defaultExperiment, "stepSize", None), 0.0)
-    internal = number(archive.description.coSimulation.fixedInternalStepSize, 0.0)
-    step = sampling_time or stated or internal or 1.0
+    default, internal = _stated_steps(archive)
+    # One second where nobody says: a step of some size is needed to try the FMU.
+    step = sampling_time or default or internal or 1.0
     document = first_document(path, archive, roles, step)
+    has_role = (*roles.states, roles.stage_cost)
     others = []
     for name, variable in archive.variables.items():
         is_output = variable.causality == "output" and variable.type in REALS
-        if is_output and not variable.shape and name not in (*roles.states, roles.stage_cost):
+        if is_output and not variable.shape and name not in has_role:
             others.append(name)
     # So the probe says of every output where it belongs.
     document["plant"]["disturbances"] = others
     document["plant"]["mapping"] = {}
     document["disturbance"] = {"law": "none"}
-    words = f"states {_some(roles.states)}; actions {_some(roles.actions)}; cost {roles.stage_cost}"
+    states_shown = _some(roles.states)
+    actions_shown = _some(roles.actions)
+    words = f"states {states_shown}; actions {actions_shown}; cost {roles.stage_cost}"
     return document, Row("roles", words, consequence)
 
 
+def _stated_steps(archive: UnpackedFmu) -> tuple[float, float]:
+    """Step sizes in s that a model description states, default and internal; 0 for none."""
+    experiment = archive.description.defaultExperiment
+    default = number(getattr(experiment, "stepSize", None), 0.0)
+    internal = number(archive.description.coSimulation.fixedInternalStepSize, 0.0)
+    return default, internal
+
+
 def _some(names: Sequence[str]) -> str:
-    more = f" … ({len(names)} in all)" if len(names) > NAMES_SHOWN else ""
-    return ", ".join(names[:NAMES_SHOWN]) + more
+    text = ", ".join(names[:NAMES_SHOWN])
+    if len(names) > NAMES_SHOWN:
+        text += f" … ({len(names)} in all)"
+    return text
 
 
 def _step_size(archive: UnpackedFmu, step: float) -> Row:
-    default = number(getattr(archive.description.defaultExperiment, "stepSize", None), 0.0)
-    internal = number(archive.description.coSimulation.fixedInternalStepSize, 0.0)
-    words = [f"default {default:g} s"] if default > 0 else ["none stated"]
+    default, internal = _stated_steps(archive)
+    words = ["none stated"]
+    if default > 0:
+        words = [f"default {default:g} s"]
     if internal > 0:
         words.append(f"fixed internal step {internal:g} s")
     follows = f"tried with {step:g} s"
@@ -219,10 +253,13 @@ def _step_size(archive: UnpackedFmu, step: float) -> Row:
 
 def _probe_rows(report: ProbeReport) -> list[Row]:
     """The probe's rows; that of the outputs with their names by kind, its start state left out."""
-    by_kind: dict[str, list[str]] = {}
+    by_kind: dict[str, list[str]] = defaultdict(list)
     for name, kind in report.kinds.items():
-        by_kind.setdefault(kind.value, []).append(name)
-    kinds = "; ".join(f"{_some(names)}: {words}" for words, names in by_kind.items())
+        by_kind[kind.value].append(name)
+    sentences = []
+    for words, names in by_kind.items():
+        sentences.append(f"{_some(names)}: {words}")
+    kinds = "; ".join(sentences)
     rows = []
     for row in report.rows:
         if row.subject == "outputs":
@@ -235,11 +272,15 @@ def _probe_rows(report: ProbeReport) -> list[Row]:
 
 def _starts_row(scenario: Scenario, archive: UnpackedFmu) -> Row:
     parameters = start_parameters(scenario, archive)
+    words = []
+    for name, parameter in parameters.items():
+        words.append(f"{name} by {parameter}")
     missing = [name for name in scenario.plant.states if name not in parameters]
-    words = [f"{name} by {parameter}" for name, parameter in parameters.items()]
+    follows = "episodes can start anywhere"
+    # Those of some states alone are of no use.
     if missing:
         words.append(f"nothing sets {_some(missing)}")
-    follows = "episodes start where the FMU does" if missing else "episodes can start anywhere"
+        follows = "episodes start where the FMU does"
     return Row("start state", _some(words), follows)
 
 
@@ -247,6 +288,7 @@ def _run_row(scenario: Scenario) -> Row:
     """Steps with the start values held; raises PlantError where the FMU fails."""
     with FmuPlant(scenario) as plant:
         plant.reset(0)
+        # Start values need not lie between the FMU's own bounds.
         action = scenario.saturate(scenario.reference_action)
         for _ in range(SAMPLES):
             state = plant.step(action).s
@@ -256,7 +298,9 @@ def _run_row(scenario: Scenario) -> Row:
 
 def _verdict(report: ProbeReport) -> str:
     words = ["it can be a plant"]
-    if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
+    kinds = set(report.kinds.values())
+    # Where no output tells, they are read after the step as well, for want of a proof.
+    if report.outputs == "after-step" and kinds & set(AFTER):
         words.append('its outputs are read after the step (plant.outputs = "after-step")')
     if report.restart.name != "RESET":
         words.append(report.restart.value + " for each episode")

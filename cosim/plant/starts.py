@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 from cosim.core.errors import PlantError
@@ -45,6 +46,7 @@ def start_parameters(scenario: Scenario, fmu: UnpackedFmu) -> dict[str, str]:
             # One that sets another state's start already.
             if candidate in parameters.values():
                 continue
+            # Another start than its own: a parameter without effect would seem to set that.
             value = _start_that_moves(fmu, state, candidate, initial[state])
             if _starts_at(scenario, fmu, {state: candidate}, {state: value}):
                 parameters[state] = candidate
@@ -67,24 +69,27 @@ def candidates(fmu: UnpackedFmu, state: str) -> Iterator[str]:
         state: name of the state.
     """
     path, base, index = split_name(state)
-    # Settable variables by where they stand, with their bases.
-    settable: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    # Settable variables by where they stand, path and index, with their bases.
+    settable: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
     for name, variable in fmu.variables.items():
-        if variable.causality not in ("parameter", "structuralParameter") or name == state:
+        if name == state:
+            continue
+        if variable.causality not in ("parameter", "structuralParameter"):
             continue
         if variable.type in REALS and not variable.shape:
             other_path, other_base, other_index = split_name(name)
-            settable.setdefault((other_path, other_index), []).append((name, other_base))
+            settable[other_path, other_index].append((name, other_base))
     # From the state's own component outwards.
     while True:
-        beside = settable.get((path, index), [])
+        beside = settable[path, index]
         for word in START_WORDS:
             for name, other_base in beside:
                 if _has_word(other_base, base, word):
                     yield name
         if not path:
             break
-        path = split_name(path.removesuffix("."))[0]
+        component = path.removesuffix(".")
+        path, _, _ = split_name(component)
     variable = fmu.variable(state)
     if variable is not None and has_start(variable):
         yield state
@@ -131,7 +136,10 @@ def _starting_by(
 ) -> Scenario:
     """The scenario with these states alone, or with all of them and no start to be set."""
     plant = scenario.plant
-    kept = [i for i, name in enumerate(plant.states) if not parameters or name in parameters]
+    kept = []
+    for i, name in enumerate(plant.states):
+        if not parameters or name in parameters:
+            kept.append(i)
     document = scenario.to_dict()
     # Every list with an entry for each state.
     for table, field in (
@@ -145,12 +153,16 @@ def _starting_by(
     ):
         entries = document[table][field]
         document[table][field] = [entries[i] for i in kept]
+    table_of_plant = document["plant"]
     names = []
     if parameters:
-        document["plant"]["initial_state"] = list(values)
-        names = [parameters[plant.states[i]] for i in kept]
-    document["plant"]["mapping"] = {"initial_state": names}
-    document["plant"]["disturbances"] = []
+        table_of_plant["initial_state"] = list(values)
+        for i in kept:
+            state = plant.states[i]
+            names.append(parameters[state])
+    # Nothing else is set: no noise may move the start.
+    table_of_plant["mapping"] = {"initial_state": names}
+    table_of_plant["disturbances"] = []
     document["disturbance"] = {"law": "none"}
     return Scenario.from_dict(document)
 
@@ -193,8 +205,9 @@ def _starts_at(
     except PlantError:
         return False
     for name, state, value in zip(names, reached, asked, strict=True):
+        miss = abs(state - value)
         # Written so that no number is a miss, too.
-        if not abs(state - value) <= AGREES * _move(fmu, name, value):
+        if not miss <= AGREES * _move(fmu, name, value):
             return False
     return True
 
@@ -205,8 +218,11 @@ def _move(
     value: float,
 ) -> float:
     """By how much a probe moves a state's start."""
-    nominal = number(getattr(fmu.variable(state), "nominal", None), 0.0)
-    return PROBED * max(abs(value), abs(nominal), 1e-3)
+    stated = getattr(fmu.variable(state), "nominal", None)
+    nominal = number(stated, 0.0)
+    # A state that starts at zero has a scale, too.
+    scale = max(abs(value), abs(nominal), 1e-3)
+    return PROBED * scale
 
 
 def _start_that_moves(
@@ -218,8 +234,10 @@ def _start_that_moves(
     """A start beside the initial one, within the range of the state and of the parameter."""
     move = _move(fmu, state, initial)
     state_low, state_high = fmu.range(state)
-    low, high = fmu.range(parameter)
+    parameter_low, parameter_high = fmu.range(parameter)
+    low = max(state_low, parameter_low)
+    high = min(state_high, parameter_high)
     for value in (initial + move, initial - move):
-        if max(state_low, low) <= value <= min(state_high, high):
+        if low <= value <= high:
             return value
     return initial + move

@@ -52,18 +52,27 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
         internal = number(simulation.fixedInternalStepSize, 0.0)
         # Within rounding: both are decimal fractions of a second.
         count = step / internal if step and internal > 0 else 1.0
-        if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
+        whole = round(count)
+        if whole < 1 or abs(count - whole) > 1e-9 * count:
             yield (
                 f"{name} steps by multiples of {internal:g} s (fixedInternalStepSize), and the "
                 f"communication step of {step:g} s is none"
             )
-    numbers = [v for v in fmu.description.modelVariables if v.type not in NO_NUMBERS]
-    if not any(_can_act(variable) for variable in numbers):
+    can_be_acted_on = False
+    can_be_seen = False
+    for variable in fmu.description.modelVariables:
+        if variable.type in NO_NUMBERS:
+            continue
+        if _can_act(variable):
+            can_be_acted_on = True
+        if variable.causality in ("output", "local"):
+            can_be_seen = True
+    if not can_be_acted_on:
         yield (
             f"{name} has no input and no tunable parameter that is a number: there is nothing for "
             "a controller to act on"
         )
-    if not any(variable.causality in ("output", "local") for variable in numbers):
+    if not can_be_seen:
         yield f"{name} has no output that is a number: there is nothing for a controller to see"
 
 
@@ -81,6 +90,7 @@ def has_start(variable: Any) -> bool:
     """Whether an importer may set the variable's start value, by FMI's causality and `initial`."""
     if variable.variability == "constant":
         return False
+    # FMI's default for these is "calculated": the FMU then has no start to set.
     if variable.causality in ("output", "local"):
         return variable.initial in ("exact", "approx")
     return variable.causality not in ("calculatedParameter", "independent")
@@ -88,7 +98,10 @@ def has_start(variable: Any) -> bool:
 
 def interface(fmu: UnpackedFmu) -> type[Fmi2Instance] | type[Fmi3Instance]:
     """The class of an FMU's instances, by its version of FMI."""
-    return Fmi2Instance if fmu.description.fmiVersion[0] == "2" else Fmi3Instance
+    # Another version has been refused as the FMU was unpacked.
+    if fmu.description.fmiVersion.startswith("2"):
+        return Fmi2Instance
+    return Fmi3Instance
 
 
 def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
@@ -105,6 +118,7 @@ def experiment(fmu: UnpackedFmu, plant: PlantTable | None = None) -> Experiment:
     """
     default = fmu.description.defaultExperiment
     start = number(getattr(default, "startTime", None), 0.0)
+    # No solver keeps to a tolerance of 0: it is none.
     tolerance = number(getattr(default, "tolerance", None), 0.0) or None
     if plant is None:
         return Experiment(start, None, tolerance)
@@ -143,30 +157,34 @@ class Wiring:
     def __init__(self, scenario: Scenario, fmu: UnpackedFmu) -> None:
         plant = scenario.plant
         mapping = plant.mapping
+        sensors = scenario.sensors or ()
+        signals = scenario.signals or ()
         self._scenario = scenario
         self._fmu = fmu
         self.interface = interface(fmu)
         self.experiment = experiment(fmu, plant)
-        self.outputs = self._number_places((plant.stage_cost, *plant.disturbances), "plant")
-        signals = scenario.signals or ()
+        own_outputs = (plant.stage_cost, *plant.disturbances)
+        self.outputs = self._number_places(own_outputs, "plant")
+        # Behind these, so that the disturbances stay where they are.
         self.outputs += self._number_places(scenario.priced, "signal")
         self.states = self._number_places(plant.states, "plant.states")
-        variables = [sensor.variable for sensor in scenario.sensors or ()]
-        self.sensors = self._number_places(variables, "sensor")
+        sensed = [sensor.variable for sensor in sensors]
+        self.sensors = self._number_places(sensed, "sensor")
         self.initial = self._number_places(mapping.initial_state, "plant.mapping.initial_state")
         self.seeds: list[Place] = []
         for name in mapping.seed:
             # One of 64 bits takes both words.
-            if not (self.seeds and self.seeds[-1].type in WIDE_INTEGERS):
-                self.seeds.append(self._place(name, "plant.mapping.seed", _no_word))
+            if self.seeds and self.seeds[-1].type in WIDE_INTEGERS:
+                continue
+            place = self._place(name, "plant.mapping.seed", _no_word)
+            self.seeds.append(place)
+        # Names of the first of the starts; the seed's words stand behind them.
         self.start_names: list[str] = []
         self.starts = self._start_places()
         self._require_whole_arrays([place for place, _ in self.starts])
-        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
-        self._require_whole_arrays(self.inputs)
+        self.inputs = self._written_places(plant.actions, "plant.actions")
         driven = [signal.plant for signal in signals if signal.plant is not None]
-        self.signals = [self._place(name, "signal", _not_written) for name in driven]
-        self._require_whole_arrays(self.signals)
+        self.signals = self._written_places(driven, "signal")
 
     def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
         """Places to write at the start of a sample, and the values, by the sample's number."""
@@ -175,9 +193,13 @@ class Wiring:
         for change in scenario.plant.changes or ():
             # At the first sample that begins at its time or later.
             sample = ceil(change.time / scenario.sampling_time)
-            places, values = changes.setdefault(sample, ([], []))
+            # Two changes may come to one sample.
+            if sample not in changes:
+                changes[sample] = ([], [])
+            places, values = changes[sample]
             for name, value in change.parameters.items():
-                places.append(self._place(name, "plant.changes", _not_written))
+                place = self._place(name, "plant.changes", _not_written)
+                places.append(place)
                 values.append(value)
         for places, _ in changes.values():
             self._require_whole_arrays(places)
@@ -185,6 +207,12 @@ class Wiring:
 
     def _number_places(self, names: Sequence[str], table: str) -> list[Place]:
         return [self._place(name, table, _no_number) for name in names]
+
+    def _written_places(self, names: Sequence[str], table: str) -> list[Place]:
+        """Places of variables that are written between two steps."""
+        places = [self._place(name, table, _not_written) for name in names]
+        self._require_whole_arrays(places)
+        return places
 
     def _start_places(self) -> list[tuple[Place, float]]:
         """Places and values of all that the scenario sets before an episode, the seed as 0."""
@@ -195,7 +223,8 @@ class Wiring:
         # An FMU with one law has no code for it.
         codes = []
         if law.law in mapping.law_codes:
-            codes.append(mapping.law_codes[law.law])
+            code = mapping.law_codes[law.law]
+            codes.append(code)
         stochastic = float(law.law != "none")
         starts: list[tuple[Place, float]] = []
 
@@ -207,7 +236,8 @@ class Wiring:
             listed = [names] if isinstance(names, str) else names or ()
             # Either may be left out; the scenario has checked that they fit.
             for name, value in zip(listed, values, strict=False):
-                starts.append(self._start_value(name, float(value), field))
+                start = self._start_value(name, float(value), field)
+                starts.append(start)
 
         add("plant.mapping.initial_state", mapping.initial_state, plant.initial_state)
         add("plant.mapping.sampling_time", mapping.sampling_time, [scenario.sampling_time])
@@ -222,8 +252,10 @@ class Wiring:
             for name in mapping.time_constant or ():
                 if self._fmu.variable(name) is not None:
                     add("plant.mapping.time_constant", name, [0.0])
+        # After all others: what the user sets by name is in force.
         for name, value in plant.parameters.items():
             add("plant.parameters", name, [value])
+        # Each reset puts the episode's words in the place of these (`seed_words`).
         for place in self.seeds:
             starts.append((place, 0.0))
         return starts
@@ -237,6 +269,7 @@ class Wiring:
         def misfit(variable: Any) -> str:
             if variable.type not in self.interface.setters:
                 return f"is {_a(variable.type)}, which cannot be set here"
+            # It would be rounded without a word as it is written.
             if variable.type not in REALS and value != int(value):
                 return f"is {_a(variable.type)} and cannot take {value}"
             if not has_start(variable):
@@ -244,7 +277,8 @@ class Wiring:
             return ""
 
         self.start_names.append(name)
-        return self._place(name, table, misfit), value
+        place = self._place(name, table, misfit)
+        return place, value
 
     def _place(
         self,
@@ -270,35 +304,44 @@ class Wiring:
         fault = misfit(variable)
         if shape and not fault:
             brackets = name.removeprefix(variable.name)
+            words = brackets.removeprefix("[").removesuffix("]").split(",")
+            # No number, another count of them, or one beyond the array's end.
             try:
-                indices = brackets.removeprefix("[").removesuffix("]").split(",")
-                index = int(np.ravel_multi_index([int(i) for i in indices], shape))
+                indices = [int(word) for word in words]
+                index = int(np.ravel_multi_index(indices, shape))
             except ValueError:
                 last = ",".join(str(size - 1) for size in shape)
                 fault = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
         if fault:
             raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {fault}; {asked} it")
         size = prod(shape)
+        unknown = (nan,) * size
         return Place(
-            int(variable.valueReference),
-            str(variable.type),
-            index,
-            _start_values(variable, size) or (nan,) * size,
-            variable.causality == "structuralParameter",
+            reference=int(variable.valueReference),
+            type=str(variable.type),
+            element=index,
+            starts=_start_values(variable, size) or unknown,
+            structural=variable.causality == "structuralParameter",
         )
 
     def _require_whole_arrays(self, places: Sequence[Place]) -> None:
         """Raise PlantError where an array whose start values are not known is set in part."""
         # FMI sets an array as a whole, so that the elements nobody names need a value.
-        unknown = [place for place in places if any(map(isnan, place.starts))]
+        named_elements: dict[tuple[int, str], set[int]] = {}
+        unknown = []
+        for place in places:
+            if any(map(isnan, place.starts)):
+                unknown.append(place)
+                array = (place.reference, place.type)
+                named_elements.setdefault(array, set()).add(place.element)
         for place in unknown:
             array = (place.reference, place.type)
-            named = {other.element for other in unknown if (other.reference, other.type) == array}
-            if len(named) == len(place.starts):
+            n_elements = len(place.starts)
+            if len(named_elements[array]) == n_elements:
                 continue
             raise PlantError(
                 f"array '{self._name_of(place)}' of FMU '{self._fmu.path.name}' has "
-                f"{len(place.starts)} elements by plant.parameters, for which its description "
+                f"{n_elements} elements by plant.parameters, for which its description "
                 f"states no start values: scenario '{self._scenario.name}' must name each where "
                 "it names one"
             )
@@ -329,7 +372,9 @@ def _start_values(variable: Any, size: int) -> tuple[float, ...] | None:
 
     That is so where a structural parameter gives an array another size.
     """
-    stated = ["0"] if variable.type in NO_NUMBERS else str(variable.start or 0).split()
+    stated = ["0"]
+    if variable.type not in NO_NUMBERS:
+        stated = str(variable.start or 0).split()
     if size == 1:
         # Its name gives all of it.
         stated = stated[:1]
@@ -357,12 +402,15 @@ def _not_written(variable: Any) -> str:
 
 
 def _no_word(variable: Any) -> str:
-    what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
-    return "" if variable.type in INTEGERS else what
+    if variable.type in INTEGERS:
+        return ""
+    return f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
 
 
 def _a(noun: str) -> str:
-    return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
+    # Not of "UInt32", which begins with a sound of y.
+    article = "an" if noun[:1].lower() in "aeio" else "a"
+    return f"{article} {noun}"
 
 
 def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
@@ -415,8 +463,9 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
     # After the starts, in which the seed's words are 0.
     for place, word in seed_words(plant_seed, wiring.seeds):
         name = names[place.reference, place.type]
+        signed = word
         # FMI 2.0's Integer has a sign.
-        is_negative = place.type == "Integer" and word >= 1 << 31
-        signed = word - (1 << 32) if is_negative else word
+        if place.type == "Integer" and word >= 1 << 31:
+            signed -= 1 << 32
         values[name] = (place.type, signed)
     return values

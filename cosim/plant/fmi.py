@@ -76,13 +76,19 @@ class UnpackedFmu:
         # Many tools write elements as scalars of such a name.
         if name in self.variables:
             return self.variables[name]
-        array = self.variables.get(name.partition("[")[0])
-        return array if array is not None and array.shape else None
+        array_name, _, _ = name.partition("[")
+        array = self.variables.get(array_name)
+        if array is None or not array.shape:
+            return None
+        return array
 
     def unit(self, name: str) -> str:
         """Unit of a variable or an array's element; empty where it is not stated."""
         variable = self.variable(name)
-        stated = variable and (variable.unit or getattr(variable.declaredType, "unit", None))
+        if variable is None:
+            return ""
+        # The variable's own goes before its type's.
+        stated = variable.unit or getattr(variable.declaredType, "unit", None)
         return str(stated or "")
 
     def range(self, name: str) -> tuple[float, float]:
@@ -119,7 +125,10 @@ _ENDS: set[float] = set()
 """Least and greatest integers of each type, with a sign and without."""
 for _bits in (8, 16, 32, 64):
     _half = 1 << _bits - 1
-    _ENDS |= {float(-_half), float(_half - 1), float(2 * _half - 1)}
+    _least = -_half
+    _greatest = _half - 1
+    _greatest_unsigned = 2 * _half - 1
+    _ENDS |= {float(_least), float(_greatest), float(_greatest_unsigned)}
 
 
 def number(stated: str | float | None, otherwise: float) -> float:
@@ -129,11 +138,16 @@ def number(stated: str | float | None, otherwise: float) -> float:
         stated: its text.
         otherwise: what it is where the text is missing or no number.
     """
+    if stated is None:
+        return otherwise
     try:
-        value = otherwise if stated is None else float(stated)
+        value = float(stated)
     except ValueError:
         return otherwise
-    return otherwise if isnan(value) else value
+    # Every comparison with it would be false.
+    if isnan(value):
+        return otherwise
+    return value
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
@@ -147,6 +161,7 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
     the very path given. Raises PlantError on a missing, corrupt or suspicious archive.
     """
     path = fmus.path(str(fmu)) if str(fmu) in SHIPPED_FMUS else Path(fmu)
+    # A misspelt name of a shipped one, most likely.
     if path.suffix != ".fmu" and len(path.parts) == 1:
         raise PlantError(
             f"unknown FMU '{fmu}'; shipped are {', '.join(SHIPPED_FMUS)}, or give the path of an "
@@ -164,9 +179,12 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
     # A file that has been replaced meanwhile is another FMU.
     key = (path, status.st_mtime_ns, status.st_size)
     with _unpack_lock:
-        if key not in _unpacked or not _unpacked[key].folder.is_dir():
-            _unpacked[key] = _unpack(path)
-        return _unpacked[key]
+        unpacked = _unpacked.get(key)
+        # A user may have emptied the cache while this process runs.
+        if unpacked is None or not unpacked.folder.is_dir():
+            unpacked = _unpack(path)
+            _unpacked[key] = unpacked
+        return unpacked
 
 
 def _unpack(path: Path) -> UnpackedFmu:
@@ -177,8 +195,9 @@ def _unpack(path: Path) -> UnpackedFmu:
                 raise PlantError(f"'{path}' is not an FMU: it has no {DESCRIPTION}")
             # Of the very file that is unpacked, which may be replaced by another one now.
             stream.seek(0)
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-            folder = place(archive, digest)
+            digest = hashlib.file_digest(stream, "sha256")
+            sha256 = digest.hexdigest()
+            folder = place(archive, sha256)
             entries = frozenset(archive.namelist())
     except PlantError:
         raise
@@ -190,7 +209,14 @@ def _unpack(path: Path) -> UnpackedFmu:
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
     description, flaws = _describe(path, folder)
-    return UnpackedFmu(path, digest, folder, description, entries, flaws)
+    return UnpackedFmu(
+        path=path,
+        sha256=sha256,
+        folder=folder,
+        description=description,
+        entries=entries,
+        flaws=flaws,
+    )
 
 
 def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
@@ -202,20 +228,24 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
     if len(entries) > MAX_ENTRIES:
         raise PlantError(f"FMU '{path}' is refused: more than {MAX_ENTRIES} entries")
     # A few bytes may be packed that fill a disk.
-    if sum(entry.file_size for entry in entries) > MAX_BYTES:
+    n_bytes = sum(entry.file_size for entry in entries)
+    if n_bytes > MAX_BYTES:
         raise PlantError(f"FMU '{path}' is refused: unpacks to more than {MAX_BYTES >> 20} MiB")
     for entry in entries:
         entry.filename = entry.filename.replace("\\", "/")
         original = entry.orig_filename
         name = PurePosixPath(original.replace("\\", "/"))
         # zipfile cuts a name at a null byte; a colon is a drive on Windows.
-        if name.is_absolute() or ".." in name.parts or {":", "\0"} & set(original):
+        has_evil_sign = ":" in original or "\0" in original
+        if name.is_absolute() or ".." in name.parts or has_evil_sign:
             raise PlantError(
-                f"FMU '{path}' is refused: entry {entry.orig_filename!r} leads outside its folder"
+                f"FMU '{path}' is refused: entry {original!r} leads outside its folder"
             )
         # The upper half of the attributes is Unix's mode.
-        if stat.S_ISLNK(entry.external_attr >> 16):
+        mode = entry.external_attr >> 16
+        if stat.S_ISLNK(mode):
             raise PlantError(f"FMU '{path}' is refused: entry '{name}' is a link")
+    # zipfile looks a name up here, and had the backslashes.
     archive.NameToInfo = {entry.filename: entry for entry in entries}
 
 
@@ -231,7 +261,12 @@ def _describe(path: Path, folder: Path) -> tuple[Any, tuple[str, ...]]:
     # fmpy's ValidationError, its bare Exception, and lxml's errors on text that is not XML.
     except Exception as error:
         problems = getattr(error, "problems", [error])
-        flaws = tuple(" ".join(str(problem).split()) for problem in problems)
+        lines = []
+        for problem in problems:
+            # One line each: an error of lxml has several.
+            words = str(problem).split()
+            lines.append(" ".join(words))
+        flaws = tuple(lines)
         description = _describe_leniently(path, folder, flaws)
     if description.fmiVersion[:2] not in ("2.", "3."):
         raise PlantError(f"FMU '{path}' is FMI {description.fmiVersion}; 2.0 and 3.0 are supported")
@@ -247,8 +282,9 @@ def _describe_leniently(
 
     Raises PlantError where it cannot be read, or lacks what a run needs.
     """
-    more = f" ({len(flaws) - 1} more)" if len(flaws) > 1 else ""
-    what_is_wrong = f"{flaws[0]}{more}"
+    what_is_wrong = flaws[0]
+    if len(flaws) > 1:
+        what_is_wrong += f" ({len(flaws) - 1} more)"
     try:
         # By the file's own path, sources/buildDescription.xml is left alone.
         description = read_model_description(str(folder / DESCRIPTION), validate=False)
@@ -277,9 +313,12 @@ def _obstacle(description: Any) -> str:
         return "its co-simulation has no modelIdentifier"
     places: dict[str, tuple[int, str]] = {}
     for variable in description.modelVariables:
-        place = variable.valueReference, variable.type
-        if places.setdefault(variable.name, place) != place:
-            return f"two variables are called '{variable.name}'"
+        name = variable.name
+        place = (variable.valueReference, variable.type)
+        # The same one twice does no harm: either gives the same number.
+        if name in places and places[name] != place:
+            return f"two variables are called '{name}'"
+        places[name] = place
     return ""
 
 
@@ -300,6 +339,7 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     folder = cache / sha256
     if _holds(folder, archive):
         return folder
+    # Workers of a study come here at the same time.
     with lock(cache / f"{sha256}.lock", 60):
         if not _holds(folder, archive):
             # A process that runs from a damaged folder keeps its open files.
@@ -317,7 +357,10 @@ def _holds(folder: Path, archive: zipfile.ZipFile) -> bool:
     try:
         for name, entry in entries.items():
             path = folder / name
-            if path.is_symlink() or path.read_bytes() != archive.read(entry):
+            # A link may lead to a file that somebody changes later.
+            if path.is_symlink():
+                return False
+            if path.read_bytes() != archive.read(entry):
                 return False
     except OSError:
         return False
@@ -335,6 +378,7 @@ def library_path(fmu: UnpackedFmu) -> Path:
     this platform by its own first bytes.
     """
     identifier = str(fmu.description.coSimulation.modelIdentifier)
+    # It becomes part of a path.
     if not (identifier.isascii() and identifier.isidentifier()):
         raise PlantError(
             f"FMU '{fmu.path}' is refused: modelIdentifier {identifier!r} is not a C identifier"
@@ -354,19 +398,28 @@ def library_path(fmu: UnpackedFmu) -> Path:
         made_for = platforms_of(path.read_bytes())
         if platform.tuple in made_for:
             return path
-        what = f"made for {' and '.join(made_for)}" if made_for else "not a shared library"
+        what = "not a shared library"
+        if made_for:
+            what = f"made for {' and '.join(made_for)}"
         reasons.append(f"its '{entry}' is {what}")
-    # Which platforms the archive has anything for.
-    filled = set()
-    for name in fmu.entries:
-        parts = name.split("/")
-        if parts[0] == "binaries" and len(parts) > 2 and not name.endswith("/"):
-            filled.add(parts[1])
-    why = "; ".join(reasons) or f"it has: {', '.join(sorted(filled)) or 'none'}"
+    why = "; ".join(reasons)
+    if not why:
+        why = f"it has: {', '.join(_filled_platforms(fmu)) or 'none'}"
     raise PlantError(
         f"FMU '{fmu.path}' has no binary for {platform.tuple} ({why}); build one from its sources, "
         "the shipped FMU's by `cosim fmu build --out DIR` with a C compiler, and name that file"
     )
+
+
+def _filled_platforms(fmu: UnpackedFmu) -> list[str]:
+    """Folders of platforms that the archive has any file for, sorted."""
+    folders = set()
+    for name in fmu.entries:
+        parts = name.split("/")
+        is_file = len(parts) > 2 and not name.endswith("/")
+        if parts[0] == "binaries" and is_file:
+            folders.add(parts[1])
+    return sorted(folders)
 
 
 def _instead(
@@ -376,15 +429,27 @@ def _instead(
 ) -> list[str]:
     """What a platform's folder has in place of the library; nothing where there is no folder."""
     prefix = f"binaries/{folder}/"
+    library = entry.removeprefix(prefix)
     inside = sorted(name for name in fmu.entries if name.startswith(prefix))
+    if not inside:
+        return []
     names = [name.removeprefix(prefix) for name in inside if not name.endswith("/")]
-    if names:
-        return [f"its '{prefix}' has {', '.join(names[:5])} and no {entry.removeprefix(prefix)}"]
-    return [f"its '{prefix}' is empty"] if inside else []
+    if not names:
+        return [f"its '{prefix}' is empty"]
+    # A few suffice: it may hold a tool's whole runtime.
+    return [f"its '{prefix}' has {', '.join(names[:5])} and no {library}"]
 
 
-WARNING, DISCARD, FATAL = 1, 2, 4
-_STATUS_WORDS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
+WARNING = 1
+DISCARD = 2
+FATAL = 4
+"""Values of FMI's status, the same in both versions."""
+_STATUS_WORDS = {
+    2: "discard",
+    3: "error",
+    4: "fatal",
+    5: "pending",
+}
 
 _alive: Counter[str] = Counter()
 
@@ -447,7 +512,9 @@ Intermediate = Callable[[float, NDArray[np.float64]], None]
 
 def _as(buffer: Any, value: float) -> float:
     """A number as a buffer of a C type takes it: an integer is the nearest one."""
-    return value if buffer._type_ in (ctypes.c_double, ctypes.c_float) else round(value)
+    if buffer._type_ in (ctypes.c_double, ctypes.c_float):
+        return value
+    return round(value)
 
 
 class Native(ctypes.Structure):
@@ -522,6 +589,7 @@ def _copy_of(library: Path) -> Iterator[Path]:
     handle, name = tempfile.mkstemp(library.suffix, f".{library.stem}-", library.parent)
     os.close(handle)
     try:
+        # Beside it, where its run path leads to the libraries that it needs.
         yield Path(shutil.copyfile(library, name))
     finally:
         # Windows keeps a file that is loaded.

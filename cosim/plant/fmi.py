@@ -472,6 +472,14 @@ class Place(NamedTuple):
     structural: bool = False
 
 
+class _VariableCall(NamedTuple):
+    """The call that sets or gets one variable: its name, its arguments, and their buffer."""
+
+    name: str
+    arguments: tuple[Any, ...]
+    values: Any
+
+
 class Order(IntEnum):
     """When a step reads the outputs; the numbers are those of the controllers' `fmu.h`.
 
@@ -658,7 +666,8 @@ class Instance(ABC):
         self.fatal = False
         self._interface = fmu.description.coSimulation
         self._intermediate = intermediate
-        self._places = inputs, outputs, states = exchanged
+        self._places = exchanged
+        inputs, outputs, states = exchanged
         if self._interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
             raise CapabilityError(
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
@@ -668,7 +677,9 @@ class Instance(ABC):
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._functions: dict[str, Any] = {}
-        self.drivable = all(map(self._all_real, self._places)) and not reading.late
+        # Compiled code has one order of calls for all outputs, and converts nothing.
+        all_real = all(self._all_real(places) for places in exchanged)
+        self.drivable = all_real and not reading.late
         self.experiment = experiment
         self._order = reading.order
         self._step_size = ctypes.c_double(step_size)
@@ -683,28 +694,25 @@ class Instance(ABC):
         self.outputs_view: NDArray[np.float64] = np.frombuffer(memoryview(self.outputs))
         self.states_view: NDArray[np.float64] = np.frombuffer(memoryview(self.states))
         self._do_step = self._function("DoStep")
+        # Bound once for all steps.
         self._first, self._second, self._third = self._calls_of_a_step(reading)
         self._to_start = self._calls_to_start()
         self._start_places = [place for place, _ in starts]
         # Sizes of arrays come first, in a mode of their own (FMI 3.0).
-        structure_places: list[Place] = []
-        structure_values: list[float] = []
-        places: list[Place] = []
-        values: list[float] = []
-        for place, value in starts:
-            if place.structural:
-                structure_places.append(place)
-                structure_values.append(value)
-            else:
-                places.append(place)
-                values.append(value)
+        structure = [start for start in starts if start[0].structural]
         self._set_structure: Callable[[], None] | None = None
-        if structure_places:
+        if structure:
+            structure_places, structure_values = zip(*structure, strict=True)
             self._set_structure = self.writer(structure_places, structure_values)
+        others = [start for start in starts if not start[0].structural]
+        places = [place for place, _ in others]
         self._starts, self._set_starts = self._exchange(places, "Set")
-        self._starts[:] = values
-        # FMI 2 counts value references anew for each type.
-        self._start_of = {place[:3]: i for i, place in enumerate(places)}
+        self._starts[:] = [value for _, value in others]
+        self._start_of = {}
+        for i, place in enumerate(places):
+            # FMI 2 counts value references anew for each type.
+            key = (place.reference, place.type, place.element)
+            self._start_of[key] = i
 
     @abstractmethod
     def _instantiate(self, **where: Any) -> Any:
@@ -745,9 +753,10 @@ class Instance(ABC):
         # fmpy raises bare Exception when the library does not instantiate.
         except Exception as error:
             what = f"cannot be instantiated: {error}"
-        tool = self._interface.needsExecutionTool
-        hint = "; it needs the tool that made it (needsExecutionTool)" if tool else ""
-        raise PlantError(f"FMU '{self.fmu.path}' {what}{hint}{self._log()}")
+        # The likeliest reason, whatever the system's words.
+        if self._interface.needsExecutionTool:
+            what += "; it needs the tool that made it (needsExecutionTool)"
+        raise PlantError(f"FMU '{self.fmu.path}' {what}{self._log()}")
 
     def _function(self, name: str) -> Any:
         """A function pointer of our own, free of the argument types that fmpy attaches."""
@@ -843,8 +852,11 @@ class Instance(ABC):
             return *before, get_states
         late = reading.late
         outputs = self.outputs
-        values, get_late = self._exchange([self._places[1][i] for i in late], "Get")
+        _, output_places, _ = self._places
+        late_places = [output_places[i] for i in late]
+        values, get_late = self._exchange(late_places, "Get")
 
+        # All outputs were read before the step: the late ones are replaced.
         def get_late_and_states() -> None:
             get_late()
             for i, value in zip(late, values, strict=True):
@@ -857,31 +869,36 @@ class Instance(ABC):
         """A buffer for a number of each place, and a function that sets or gets them all."""
         if self._all_real(places):
             return self._exchange_reals(places, verb)
-        # Not every integer of 64 bits is a double: what is set is a list.
         count = len(places)
-        numbers: Any = [0.0] * count if verb == "Set" else (ctypes.c_double * count)()
+        # Not every integer of 64 bits is a double: what is set is a list.
+        numbers: Any = [0.0] * count
+        if verb == "Get":
+            numbers = (ctypes.c_double * count)()
         # The entries of one array are exchanged in one call, with one buffer.
-        variables: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
+        variables: dict[tuple[int, str], _VariableCall] = {}
         calls = []
         for place in places:
-            variable = place[:2]
+            variable = (place.reference, place.type)
             if variable not in variables:
                 suffix, ctype = self.setters[place.type]
                 values = (ctype * len(place.starts))()
+                # FMI sets an array as a whole: elements that nobody names have their start.
                 values[:] = [_as(values, start) for start in place.starts]
                 arguments = self._arguments([place.reference], values)
-                variables[variable] = (f"{verb}{suffix}", arguments, values)
-            calls.append((*variables[variable], place.element))
+                variables[variable] = _VariableCall(f"{verb}{suffix}", arguments, values)
+            calls.append((variables[variable], place.element))
 
-        def convert() -> None:
-            for i, (name, arguments, values, element) in enumerate(calls):
-                if verb == "Set":
-                    values[element] = _as(values, numbers[i])
-                self._call(name, *arguments)
-                if verb == "Get":
-                    numbers[i] = values[element]
+        def set_all() -> None:
+            for number, (call, element) in zip(numbers, calls, strict=True):
+                call.values[element] = _as(call.values, number)
+                self._call(call.name, *call.arguments)
 
-        return numbers, convert
+        def get_all() -> None:
+            for i, (call, element) in enumerate(calls):
+                self._call(call.name, *call.arguments)
+                numbers[i] = call.values[element]
+
+        return numbers, set_all if verb == "Set" else get_all
 
     def _exchange_reals(
         self,
@@ -910,7 +927,8 @@ class Instance(ABC):
             place: one among the `starts`.
             value: the new one.
         """
-        self._starts[self._start_of[place[:3]]] = value
+        key = (place.reference, place.type, place.element)
+        self._starts[self._start_of[key]] = value
 
     def writer(self, places: Sequence[Place], values: Sequence[float]) -> Callable[[], None]:
         """A function that writes values between two steps.
@@ -960,20 +978,28 @@ class Instance(ABC):
         self._references = []
         for places, buffer in zip(self._places, buffers, strict=True):
             references = [place.reference for place in places]
-            self._references.append(self._arguments(references, buffer)[1])
+            _, pointers, *_ = self._arguments(references, buffer)
+            self._references.append(pointers)
+        inputs, outputs, states = self._references
         return Native(
-            int(self.prefix[-1]),
-            address(self._function(f"Set{self.real}")),
-            address(self._function(f"Get{self.real}")),
-            address(self._function("DoStep")),
-            self._component,
-            *map(address, self._references),
-            *map(len, buffers),
-            *map(address, buffers),
-            self.experiment.start_time,
-            self._step_size.value,
-            self._order,
-            self.no_return.value,
+            version=int(self.prefix[-1]),
+            set=address(self._function(f"Set{self.real}")),
+            get=address(self._function(f"Get{self.real}")),
+            step=address(self._function("DoStep")),
+            component=self._component,
+            inputs=address(inputs),
+            outputs=address(outputs),
+            states=address(states),
+            n_inputs=len(self.inputs),
+            n_outputs=len(self.outputs),
+            n_states=len(self.states),
+            input=address(self.inputs),
+            output=address(self.outputs),
+            state=address(self.states),
+            start_time=self.experiment.start_time,
+            step_size=self._step_size.value,
+            order=self._order,
+            no_return=self.no_return.value,
         )
 
     def fail_native(self, fault: int, status: int) -> None:
@@ -1009,6 +1035,7 @@ class Instance(ABC):
     def serialise(self, handle: ctypes.c_void_p) -> bytes:
         """Return a saved state as bytes that any instance of this FMU can read."""
         self.require_serialised_state()
+        # The caller allocates, by a size that the FMU says.
         size = ctypes.c_size_t()
         arguments = (self._component, handle)
         self._call(f"Serialized{self._state}Size", *arguments, ctypes.byref(size))
@@ -1045,14 +1072,17 @@ class Instance(ABC):
             function: its name without FMI's prefix.
             status: what it returned.
         """
-        self.fatal |= status == FATAL
+        if status == FATAL:
+            self.fatal = True
         label = _STATUS_WORDS.get(status, f"status {status}, which FMI does not have")
         raise PlantError(
             f"FMU '{self.fmu.path.name}': {self.prefix}{function} returned {label}{self._log()}"
         )
 
     def _log(self) -> str:
-        text = "; ".join(dict.fromkeys(self.messages))
+        # An FMU may say the same at each of its attempts.
+        messages = dict.fromkeys(self.messages)
+        text = "; ".join(messages)
         self.messages.clear()
         return f": {text}" if text else ""
 
@@ -1065,8 +1095,11 @@ class Instance(ABC):
         if self.fatal:
             return
         for handle in handles:
+            # A handle into which nothing was saved is null.
             if handle.value is not None:
-                self._function(f"Free{self._state}")(self._component, ctypes.byref(handle))
+                free_state = self._function(f"Free{self._state}")
+                free_state(self._component, ctypes.byref(handle))
+        # It returns nothing, and so is none of `_function`'s.
         free = self._slave.dll[f"{self.prefix}FreeInstance"]
         free.restype = None
         free(self._component)
@@ -1094,11 +1127,13 @@ def _log(
     """
     text = (message or b"").decode("utf-8", "replace")
     known = _logs.get(instance or b"")
-    logs = [known] if known is not None else list(_logs.values())
+    logs = list(_logs.values()) if known is None else [known]
     for log in logs:
         log.append(text)
+    # Nobody is left who could put it into an error.
     if not logs and status > WARNING:
-        print(f"{(instance or b'FMU').decode('utf-8', 'replace')}: {text}", file=sys.stderr)
+        name = (instance or b"FMU").decode("utf-8", "replace")
+        print(f"{name}: {text}", file=sys.stderr)
 
 
 # fmpy's proxy, which formats the variadic message, knows one Python logger per process.
@@ -1111,7 +1146,9 @@ addLoggerProxy(ctypes.byref(_callbacks))
 
 def _optional(value: float | None, truth: Any) -> tuple[Any, Any]:
     """FMI's two arguments of a value that may be undefined: whether it is defined, and it."""
-    return truth(value is not None), ctypes.c_double(0.0 if value is None else value)
+    is_defined = truth(value is not None)
+    number = ctypes.c_double(0.0 if value is None else value)
+    return is_defined, number
 
 
 class Fmi2Instance(Instance):
@@ -1130,9 +1167,13 @@ class Fmi2Instance(Instance):
 
     def _calls_to_start(self) -> tuple[tuple[str, tuple[Any, ...]], ...]:
         start, stop, tolerance = self.experiment
-        given = (*_optional(tolerance, ctypes.c_int), ctypes.c_double(start))
+        arguments = (
+            *_optional(tolerance, ctypes.c_int),
+            ctypes.c_double(start),
+            *_optional(stop, ctypes.c_int),
+        )
         return (
-            ("SetupExperiment", (*given, *_optional(stop, ctypes.c_int))),
+            ("SetupExperiment", arguments),
             ("EnterInitializationMode", ()),
             ("ExitInitializationMode", ()),
         )
@@ -1142,6 +1183,7 @@ class Fmi2Instance(Instance):
         return (self._component, self._time, self._step_size, self.no_return)
 
     def _instantiate(self, **where: Any) -> Any:
+        # A name of its own, by which the log finds the instance (`_log`).
         name = f"cosim-{next(_instance_numbers)}"
         _logs[name.encode()] = self.messages
         slave = FMU2ByPath(instanceName=name, **where)
@@ -1172,9 +1214,13 @@ class Fmi3Instance(Instance):
 
     def _calls_to_start(self) -> tuple[tuple[str, tuple[Any, ...]], ...]:
         start, stop, tolerance = self.experiment
-        given = (*_optional(tolerance, ctypes.c_bool), ctypes.c_double(start))
+        arguments = (
+            *_optional(tolerance, ctypes.c_bool),
+            ctypes.c_double(start),
+            *_optional(stop, ctypes.c_bool),
+        )
         return (
-            ("EnterInitializationMode", (*given, *_optional(stop, ctypes.c_bool))),
+            ("EnterInitializationMode", arguments),
             ("ExitInitializationMode", ()),
         )
 
@@ -1223,20 +1269,26 @@ class Fmi3Instance(Instance):
             if element.get("intermediateUpdate") in ("true", "1"):
                 offered.add(element.get("valueReference"))
         _, _, state_places = self._places
-        states = {place.reference for place in state_places}
-        if not {str(state) for state in states} <= offered:
-            return {}
-        return {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}
+        references = {place.reference for place in state_places}
+        # A part of the states is of no use to who watches.
+        for reference in references:
+            if str(reference) not in offered:
+                return {}
+        return {
+            "intermediateUpdate": self._update,
+            "requiredIntermediateVariables": list(references),
+        }
 
     def _update(self, _: Any, time: float, __: bool, readable: bool, *___: Any) -> None:
         """Tell of the states; the FMU calls it in a step."""
-        if readable and self._raised is None and self._intermediate is not None:
-            try:
-                self._get_states()
-                self._intermediate(time, self.states_view.copy())
-            except BaseException as error:
-                # Kept until the step returns: ctypes would print and drop it.
-                self._raised = error
+        if not readable or self._raised is not None or self._intermediate is None:
+            return
+        try:
+            self._get_states()
+            self._intermediate(time, self.states_view.copy())
+        except BaseException as error:
+            # Kept until the step returns: ctypes would print and drop it.
+            self._raised = error
 
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
         n_references = len(references)
@@ -1264,7 +1316,9 @@ class Fmi3Instance(Instance):
     def _check_end(self, least: float) -> None:
         """Raise PlantError where a step ended early; `least` [s] is a time that it had to pass."""
         last = self._last_time.value
-        if self._terminate.value or self._early.value or last < least:
-            what = "run" if self._terminate.value else "step early"
+        ends_run = self._terminate.value
+        # Half a step is the least: an FMU's own time may be off by rounding.
+        if ends_run or self._early.value or last < least:
+            what = "run" if ends_run else "step early"
             self.messages.append(f"the FMU ended the {what}, at {last} s")
             self.fail("DoStep", DISCARD)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import textwrap
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -87,7 +88,10 @@ def guess_roles(
                 f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}"
             )
     # As our own plants name them.
-    noise = [name for name in _reals(fmu, "output") if f"{name}_nominal" in fmu.variables]
+    noise = []
+    for name in _reals(fmu, "output"):
+        if f"{name}_nominal" in fmu.variables:
+            noise.append(name)
     cost = stage_cost or _cost(fmu)
     return Roles(
         states=tuple(states) or tuple(_states(fmu, [*noise, cost])),
@@ -112,10 +116,11 @@ def number_roles(
         stage_cost: Stage cost, if known; else the first output that is called a cost, else the
             first output.
     """
-
     outputs = _number_names(fmu, "output") or _number_names(fmu, "local")
-    costs = [name for name in outputs if _is_cost(name)]
-    cost = stage_cost or (costs[0] if costs else outputs[0])
+    cost = stage_cost
+    if not cost:
+        costs = [name for name in outputs if _is_cost(name)]
+        cost = costs[0] if costs else outputs[0]
     others = tuple(name for name in outputs if name != cost)
     inputs = _number_names(fmu, "input")
     # One suffices to try the FMU.
@@ -139,7 +144,8 @@ def _number_names(
         if variable.causality != causality or variable.type in NO_NUMBERS:
             continue
         if not variability or variable.variability == variability:
-            names.append(elements(variable)[0])
+            first, *_ = elements(variable)
+            names.append(first)
     return tuple(names)
 
 
@@ -179,14 +185,12 @@ def draft_scenario(
     document = first_document(fmu, archive, roles, sampling_time, action)
     document, remarks = _with_what_was_seen(document, archive)
     document, more_remarks = _with_starts(document, archive, state)
+    x_start = np.array(document["plant"]["initial_state"])
+    u_start = np.array(document["controller"]["reference_action"])
     # Of all start values, those of a steady state: a controller begins there.
     undisturbed = document | {"disturbance": {"law": "none"}}
     with FmuPlant(Scenario.from_dict(undisturbed)) as plant:
-        x, u, cost = nearest_steady_state(
-            plant,
-            np.array(document["plant"]["initial_state"]),
-            np.array(document["controller"]["reference_action"]),
-        )
+        x, u, cost = nearest_steady_state(plant, x_start, u_start)
         units = plant.units
     # A violation of one unit costs some ten times what a sample does, to a power of ten.
     ten_samples = 10 * max(abs(cost), 1.0)
@@ -195,7 +199,9 @@ def draft_scenario(
     document["plant"]["initial_state"] = x.tolist()
     document["controller"] = _reference(x, u, cost)
     if str(fmu) in SHIPPED_FMUS:
-        document["controller"]["model"] = f"controllers.{str(fmu).removesuffix('_fmi3')}:model"
+        # Of a plant's two FMUs, FMI 2.0 and 3.0, the model is one.
+        plant_name = str(fmu).removesuffix("_fmi3")
+        document["controller"]["model"] = f"controllers.{plant_name}:model"
     else:
         # A file on another drive keeps its absolute path.
         with suppress(ValueError):
@@ -240,29 +246,33 @@ def first_document(
     mapping = _mapping(archive, roles.disturbances)
     n = len(roles.states)
     u = _start_vector(archive, roles.actions, action, "action")
-    action_ranges = []
+    action_lower = []
+    action_upper = []
     for name, value in zip(roles.actions, u.tolist(), strict=True):
-        action_ranges.append(action_limits(archive, name, value))
-    action_lower, action_upper = zip(*action_ranges, strict=True)
-    state_ranges = [archive.range(name) for name in roles.states]
-    state_lower, state_upper = zip(*state_ranges, strict=True)
-    disturbance: dict[str, Any] = {"law": "none"}
-    if "nominal" in mapping and "ranges" in mapping:
-        disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
-        for field in ("nominal", "ranges"):
-            disturbance[field] = [start_value(archive, name) for name in mapping[field]]
-        time_constants = [start_value(archive, name) for name in mapping.get("time_constant", ())]
-        if any(time_constants):
-            disturbance["time_constant"] = time_constants
-    is_shipped = str(fmu) in SHIPPED_FMUS
+        low, high = action_limits(archive, name, value)
+        action_lower.append(low)
+        action_upper.append(high)
+    state_lower = []
+    state_upper = []
+    for name in roles.states:
+        low, high = archive.range(name)
+        state_lower.append(low)
+        state_upper.append(high)
+    if str(fmu) in SHIPPED_FMUS:
+        scenario_name = str(fmu)
+        fmu_entry = str(fmu)
+    else:
+        scenario_name = archive.path.stem
+        fmu_entry = archive.path.as_posix()
+    description = archive.description
     return {
         "schema": 1,
-        "name": str(fmu) if is_shipped else archive.path.stem,
-        "description": str(archive.description.description or archive.description.modelName),
+        "name": scenario_name,
+        "description": str(description.description or description.modelName),
         "sampling_time": sampling_time or _sampling_time(archive, mapping),
         "discount": 0.99,
         "plant": {
-            "fmu": str(fmu) if is_shipped else archive.path.as_posix(),
+            "fmu": fmu_entry,
             "states": list(roles.states),
             "actions": list(roles.actions),
             "disturbances": list(roles.disturbances),
@@ -270,16 +280,36 @@ def first_document(
             "initial_state": [0.0] * n,
             "mapping": mapping,
         },
-        "disturbance": disturbance,
+        "disturbance": _disturbance(archive, mapping),
         "bounds": {
-            "state_lower": list(state_lower),
-            "state_upper": list(state_upper),
-            "action_lower": list(action_lower),
-            "action_upper": list(action_upper),
+            "state_lower": state_lower,
+            "state_upper": state_upper,
+            "action_lower": action_lower,
+            "action_upper": action_upper,
         },
-        "penalty": {"linear": [1.0] * n, "quadratic": [1.0] * n},
+        "penalty": {
+            "linear": [1.0] * n,
+            "quadratic": [1.0] * n,
+        },
         "controller": _reference(np.zeros(n), u, 0.0),
     }
+
+
+def _disturbance(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> dict[str, Any]:
+    """The table of the disturbances, by the start values of the parameters that set them."""
+    # A law has means and ranges: where one is missing nothing can be drawn.
+    if "nominal" not in mapping or "ranges" not in mapping:
+        return {"law": "none"}
+    # The first of the FMU's laws; one without a choice of laws is taken to draw uniformly.
+    law_codes = mapping.get("law_codes", {"uniform": 1})
+    table: dict[str, Any] = {"law": next(iter(law_codes))}
+    for field in ("nominal", "ranges", "time_constant"):
+        parameters = mapping.get(field, ())
+        table[field] = [start_value(fmu, name) for name in parameters]
+    # All zero are none: each sample is drawn anew.
+    if not any(table["time_constant"]):
+        del table["time_constant"]
+    return table
 
 
 def _with_what_was_seen(
@@ -296,7 +326,8 @@ def _with_what_was_seen(
     remarks: dict[str, str] = {}
     # It stands last, as a table of its own.
     mapping = plant.pop("mapping")
-    if report.outputs == "after-step" and set(report.kinds.values()) & set(AFTER):
+    kinds = set(report.kinds.values())
+    if report.outputs == "after-step" and kinds & set(AFTER):
         plant["outputs"] = report.outputs
         remarks["plant.outputs"] = _outputs_remark(report)
     experiment = report.experiment
@@ -324,9 +355,14 @@ def _with_what_was_seen(
 def _actions_remark(report: ProbeReport, archive: UnpackedFmu) -> str:
     """Which actions move no state, and what may be why."""
     nothing = [name for name, moves_output in report.still.items() if not moves_output]
-    alone = f", no output either by {', '.join(nothing)}," if nothing else ""
+    alone = ""
+    if nothing:
+        alone = f", no output either by {', '.join(nothing)},"
+    # A truth among the inputs is often a switch that enables the others.
     switches = [name for name in report.undriven if archive.variables[name].type == "Boolean"]
-    enable = f" such as {', '.join(switches)}" if switches else ""
+    enable = ""
+    if switches:
+        enable = f" such as {', '.join(switches)}"
     return (
         f"CHECK: no state moves by {', '.join(report.still)}{alone} as things are; an input"
         f"{enable} may have to be set by plant.parameters first"
@@ -336,8 +372,10 @@ def _actions_remark(report: ProbeReport, archive: UnpackedFmu) -> str:
 def _inputs_remark(report: ProbeReport) -> str:
     """Which inputs nobody drives."""
     pairs = [f"{name} = {start or '?'}" for name, start in report.undriven.items()]
-    more = f" and {len(pairs) - INPUTS_SHOWN} more" if len(pairs) > INPUTS_SHOWN else ""
-    inputs = ", ".join(pairs[:INPUTS_SHOWN]) + more
+    inputs = ", ".join(pairs[:INPUTS_SHOWN])
+    n_hidden = len(pairs) - INPUTS_SHOWN
+    if n_hidden > 0:
+        inputs += f" and {n_hidden} more"
     return f"CHECK: nobody drives {inputs}: what plant.parameters sets in their place stays"
 
 
@@ -368,9 +406,11 @@ def _with_starts(
             f"CHECK: no start was found for {', '.join(missing)}, so that an episode starts where "
             f"the FMU does; what was found may go into plant.parameters: {', '.join(pairs)}"
         )
+    # Where no parameter sets a state's start, its own start value tells where it begins.
     starts = [parameters.get(name, name) for name in states]
+    initial_state = _start_vector(archive, starts, state, "state")
     plant = dict(document["plant"])
-    plant["initial_state"] = _start_vector(archive, starts, state, "state").tolist()
+    plant["initial_state"] = initial_state.tolist()
     # The starts of some states alone are of no use: an episode begins at all of them.
     if not missing:
         plant["mapping"] = {"initial_state": starts} | plant["mapping"]
@@ -396,24 +436,30 @@ def _start_vector(
     option: str,
 ) -> Array:
     """The values of an option, else the FMU's start values."""
-    if values and len(values) != len(names):
+    if not values:
+        values = [start_value(fmu, name) for name in names]
+    elif len(values) != len(names):
         raise PlantError(
             f"--{option} takes {len(names)} numbers ({', '.join(names)}), not {len(values)}"
         )
-    return np.array(values or [start_value(fmu, name) for name in names], dtype=float)
+    return np.array(values, dtype=float)
 
 
 def start_value(fmu: UnpackedFmu, name: str) -> float:
     """Start value of a variable or an array's element; 0 where the FMU states none."""
     variable = fmu.variable(name)
-    stated = str(getattr(variable, "start", None) or "").split()
-    if variable is None or not stated:
+    if variable is None:
         return 0.0
+    stated = str(variable.start or "").split()
+    if not stated:
+        return 0.0
+    # One number is that of every element.
     if not variable.shape or len(stated) == 1:
         return number(stated[0], 0.0)
     # The elements stand row by row.
-    brackets = name[len(variable.name) + 1 : -1]
-    index = [int(i) for i in brackets.split(",")]
+    brackets = name.removeprefix(variable.name)
+    words = brackets.removeprefix("[").removesuffix("]").split(",")
+    index = [int(word) for word in words]
     element = int(np.ravel_multi_index(index, variable.shape))
     return number(stated[element], 0.0)
 
@@ -433,6 +479,7 @@ def action_limits(
         value: its start value.
     """
     low, high = fmu.range(name)
+    # A start value may lie beyond the range, and then neither bound would hold it.
     centre = min(max(value, low), high)
     reach = abs(centre) or 1.0
     lower = low if isfinite(low) else centre - reach
@@ -441,8 +488,11 @@ def action_limits(
 
 
 def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
-    experiment = getattr(fmu.description.defaultExperiment, "stepSize", None)
-    stated = start_value(fmu, mapping.get("sampling_time", "")) or number(experiment, 0.0)
+    # The grid of the FMU's own disturbances, if it has one, is the sampling time.
+    stated = start_value(fmu, mapping.get("sampling_time", ""))
+    if not stated:
+        experiment = fmu.description.defaultExperiment
+        stated = number(getattr(experiment, "stepSize", None), 0.0)
     if not stated > 0:
         raise PlantError(f"FMU '{fmu.path.name}' states no step size; give --sampling-time SECONDS")
     return stated
@@ -455,9 +505,10 @@ def _remarks(
 ) -> dict[str, str]:
     """Remark on each field and table by its dotted name."""
     plant = document["plant"]
+    with_units = [f"{name} [{unit}]" for name, unit in units.items() if unit]
     remarks = {
         "sampling_time": "s; CHECK",
-        "plant": "; ".join(f"{name} [{unit}]" for name, unit in units.items() if unit),
+        "plant": "; ".join(with_units),
         "plant.stage_cost": "CHECK: a cost, not a profit",
         "plant.mapping": "each reset writes these; what the FMU has no parameter for is left out",
         "bounds": "CHECK: states are bounded softly, by the penalty, actions hard; from min and "
@@ -467,10 +518,16 @@ def _remarks(
         "`cosim tuning` prints the cheapest one",
     }
     # A state may well have one bound alone; an action is sampled between two.
-    unbounded = [name for name in plant["states"] if not any(map(isfinite, fmu.range(name)))]
+    unbounded = []
+    for name in plant["states"]:
+        if not any(map(isfinite, fmu.range(name))):
+            unbounded.append(name)
     if unbounded:
         remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(unbounded)}"
-    open_ended = [name for name in plant["actions"] if not all(map(isfinite, fmu.range(name)))]
+    open_ended = []
+    for name in plant["actions"]:
+        if not all(map(isfinite, fmu.range(name))):
+            open_ended.append(name)
     if open_ended:
         remarks["bounds.action_lower"] = (
             f"CHECK: the FMU does not bound {', '.join(open_ended)} on both sides; what is missing "
@@ -481,9 +538,10 @@ def _remarks(
     if document["disturbance"]["law"] == "none":
         remarks["disturbance"] = f"CHECK: {NO_NOISE}"
     elif "time_constant" in plant["mapping"] and "time_constant" not in document["disturbance"]:
+        example = [300.0] * len(plant["disturbances"])
         remarks["disturbance"] = (
             "CHECK: drawn anew each sample; what disturbs a plant mostly has a memory, in s for "
-            f"each disturbance: time_constant = {[300.0] * len(plant['disturbances'])}"
+            f"each disturbance: time_constant = {example}"
         )
     if "model" not in document["controller"]:
         remarks["controller"] += '; add model = "my_plant:model", a model in CasADi'
@@ -507,15 +565,19 @@ def with_remarks(text: str, remarks: Mapping[str, str]) -> str:
         else:
             key = line.partition(" =")[0]
             names.append(f"{table}.{key}" if table else key)
-    above: dict[str, list[str]] = {}
+    above: dict[str, list[str]] = defaultdict(list)
     for name, remark in remarks.items():
-        place = name if name in names else name.rpartition(".")[0]
-        comment = above.setdefault(place, [])
+        place = name
+        if name not in names:
+            place, _, _ = name.rpartition(".")
+        # A comment of 100 columns; a name with a hyphen stays whole, so that one can search it.
         for words in textwrap.wrap(remark, 98, break_on_hyphens=False):
-            comment.append(f"# {words}")
+            above[place].append(f"# {words}")
     lines = [HEAD, ""]
     for name, line in zip(names, text.splitlines(), strict=True):
-        lines += [*above.pop(name, []), line]
+        # Once: a key may stand in the text again, in a list of tables.
+        lines += above.pop(name, [])
+        lines.append(line)
     return "\n".join([*lines, ""])
 
 
@@ -523,7 +585,8 @@ def _reals(fmu: UnpackedFmu, causality: str) -> list[str]:
     """Names of the scalar reals of a causality."""
     names = []
     for name, variable in fmu.variables.items():
-        if variable.causality == causality and variable.type in REALS and not variable.shape:
+        is_scalar_real = variable.type in REALS and not variable.shape
+        if variable.causality == causality and is_scalar_real:
             names.append(name)
     return names
 
@@ -536,7 +599,9 @@ def _cost(fmu: UnpackedFmu) -> str:
     costs = [name for name in outputs if _is_cost(name)]
     if len(costs) == 1:
         return costs[0]
-    which = f"{' and '.join(costs)} could be" if costs else "none is called a cost"
+    which = "none is called a cost"
+    if costs:
+        which = f"{' and '.join(costs)} could be"
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say which output is the stage cost ({which}); give "
         f"--cost NAME, one of {', '.join(outputs)}"
@@ -555,14 +620,18 @@ def _states(fmu: UnpackedFmu, others: Sequence[str]) -> list[str]:
         if getattr(variable, "derivative", None) is not None:
             continuous += elements(variable.derivative)
     if continuous:
+        # Two rates may name one array.
         return list(dict.fromkeys(continuous))
-    outputs = [name for name in _reals(fmu, "output") if name not in others]
-    started = [name for name in outputs if any(candidates(fmu, name))]
+    outputs = _reals(fmu, "output")
+    started = []
+    for name in outputs:
+        if name not in others and any(candidates(fmu, name)):
+            started.append(name)
     if started:
         return started
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no start "
-        f"parameters); give --states A,B,…, of {', '.join(_reals(fmu, 'output'))}"
+        f"parameters); give --states A,B,…, of {', '.join(outputs)}"
     )
 
 
@@ -580,12 +649,20 @@ def elements(variable: Any) -> list[str]:
 
 def _actions(fmu: UnpackedFmu, noise: Sequence[str]) -> list[str]:
     """Real inputs, but for an input D_in beside an output D: it takes the disturbance's place."""
-    inputs = [name for name in _reals(fmu, "input") if name.removesuffix("_in") not in noise]
+    inputs = []
+    for name in _reals(fmu, "input"):
+        if name.removesuffix("_in") not in noise:
+            inputs.append(name)
     if inputs:
         return inputs
-    parameters = _reals(fmu, "parameter")
-    tunable = [name for name in parameters if fmu.variables[name].variability == "tunable"]
-    cure = f"; give --actions A,B,…, of its tunable {', '.join(tunable)}" if tunable else ""
+    # Most tunable parameters are no actuators: which of them is, the user has to say.
+    tunable = []
+    for name in _reals(fmu, "parameter"):
+        if fmu.variables[name].variability == "tunable":
+            tunable.append(name)
+    cure = ""
+    if tunable:
+        cure = f"; give --actions A,B,…, of its tunable {', '.join(tunable)}"
     raise PlantError(f"FMU '{fmu.path.name}' has no real input to act on{cure}")
 
 
@@ -601,7 +678,10 @@ def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
 
     table: dict[str, Any] = {}
     if is_parameter("seed", INTEGERS):
-        table["seed"] = [name for name in ("seed", "seedHigh") if is_parameter(name, INTEGERS)]
+        words = ["seed"]
+        if is_parameter("seedHigh", INTEGERS):
+            words.append("seedHigh")
+        table["seed"] = words
     if is_parameter("sampling_time", REALS):
         table["sampling_time"] = "sampling_time"
     if is_parameter("stochastic", ("Boolean",)):
@@ -666,25 +746,38 @@ def nearest_steady_state(
 
     def residual(z: Array) -> Array:
         """How far a sample carries the states, in their scales, (n,)."""
-        x, u = z[:n], z[n:]
+        x = z[:n]
+        u = z[n:]
         plant.reset(0, x)
         movement = plant.step(u).s - x
         return movement / scale[:n]
 
-    precise = {"diff_step": DIFFERENCE, "gtol": 1e-15, "ftol": None, "xtol": None}
     start = np.clip(start, lower, upper)
     # SciPy's own warnings, of a step that is lost.
     with np.errstate(divide="ignore", invalid="ignore"):
-        result = least_squares(residual, start, "3-point", (lower, upper), x_scale=scale, **precise)
+        result = least_squares(
+            residual,
+            start,
+            jac="3-point",
+            bounds=(lower, upper),
+            x_scale=scale,
+            diff_step=DIFFERENCE,
+            # It ends where the gradient vanishes, and not where its steps are short.
+            gtol=1e-15,
+            ftol=None,
+            xtol=None,
+        )
     z = result.x
-    residual_left = float(np.max(np.abs(result.fun)))
+    errors = np.abs(result.fun)
+    residual_left = float(np.max(errors))
     if residual_left > LOOSE:
         raise PlantError(
             f"FMU '{plant.fmu_path.name}' has no steady state near its start values (a sample "
             f"still moves a state by {residual_left:.2g} of its scale); give other start "
             "values by --state and --action"
         )
-    x, u = z[:n], z[n:]
+    x = z[:n]
+    u = z[n:]
     plant.reset(0, x)
     cost = plant.step(u).stage_cost
     return x, u, cost

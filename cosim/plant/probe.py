@@ -154,23 +154,32 @@ def subject_of(
     plant = scenario.plant
     step = plant.communication_step or scenario.sampling_time
     steps = round(scenario.sampling_time / step)
-    pairs = []
+    lows = []
+    highs = []
     for i, name in enumerate(plant.actions):
         reference = float(scenario.reference_action[i])
         lower = float(scenario.action_lower[i])
         upper = float(scenario.action_upper[i])
-        pairs.append(_two_values(fmu.variable(name), reference, lower, upper))
+        low, high = _two_values(fmu.variable(name), reference, lower, upper)
+        lows.append(low)
+        highs.append(high)
     outputs = (plant.stage_cost, *plant.disturbances, *scenario.priced)
+    exchanged = (
+        tuple(wiring.inputs),
+        tuple(wiring.outputs),
+        tuple(wiring.states),
+    )
     return Subject(
         fmu=fmu,
         names=(plant.actions, outputs, plant.states),
-        exchanged=(tuple(wiring.inputs), tuple(wiring.outputs), tuple(wiring.states)),
+        exchanged=exchanged,
         starts=tuple(wiring.starts),
         start_names=tuple(wiring.start_names),
+        # As `FmuPlant` steps: a whole number of times in a sample.
         step=scenario.sampling_time / steps,
         experiment=wiring.experiment,
-        low=tuple(low for low, _ in pairs),
-        high=tuple(high for _, high in pairs),
+        low=tuple(lows),
+        high=tuple(highs),
     )
 
 
@@ -187,12 +196,15 @@ def _two_values(
         lower = ceil(lower)
         upper = floor(upper)
         value = min(max(round(value), lower), upper)
-        return value, float(upper if value != upper else lower)
+        another = upper if value != upper else lower
+        return value, float(another)
     value = min(max(value, lower), upper)
     distance = 0.25 * (upper - lower)
     # Upwards, or downwards where that would leave the range.
     other = value + distance
-    return value, other if other <= upper else value - distance
+    if other > upper:
+        other = value - distance
+    return value, other
 
 
 def bare_subject(
@@ -230,25 +242,38 @@ def bare_subject(
             differentiated.append(variable.derivative.name)
     actions = tuple(actions or real_inputs)
     states = tuple(states or dict.fromkeys(differentiated) or real_outputs)
-    outputs = tuple(outputs or [name for name in real_outputs if name not in states])
+    # A state among the outputs is read as a state, and would be tried twice.
+    other_outputs = [name for name in real_outputs if name not in states]
+    outputs = tuple(outputs or other_outputs)
     default = fmu.description.defaultExperiment
     stated = step or number(getattr(default, "stepSize", None), 0.0)
     internal = number(fmu.description.coSimulation.fixedInternalStepSize, 0.0)
-    pairs = []
+    lows = []
+    highs = []
     for name in actions:
-        value = number(str(known[name].start or 0).split()[0], 0.0)
+        variable = known[name]
+        # Of an array the first element.
+        first_start, *_ = str(variable.start or 0).split()
+        value = number(first_start, 0.0)
         reach = max(abs(value), 1.0)
-        pairs.append(_two_values(known[name], value, value - reach, value + reach))
+        low, high = _two_values(variable, value, value - reach, value + reach)
+        lows.append(low)
+        highs.append(high)
+    exchanged = (
+        _places(fmu, actions),
+        _places(fmu, outputs),
+        _places(fmu, states),
+    )
     return Subject(
         fmu=fmu,
         names=(actions, outputs, states),
-        exchanged=(_places(fmu, actions), _places(fmu, outputs), _places(fmu, states)),
+        exchanged=exchanged,
         starts=(),
         start_names=(),
         step=stated or internal or 1.0,
         experiment=experiment(fmu),
-        low=tuple(low for low, _ in pairs),
-        high=tuple(high for _, high in pairs),
+        low=tuple(lows),
+        high=tuple(highs),
     )
 
 
@@ -258,7 +283,8 @@ def _places(fmu: UnpackedFmu, names: Sequence[str]) -> tuple[Place, ...]:
         variable = fmu.variable(name)
         if variable is None:
             raise PlantError(f"FMU '{fmu.path.name}' has no variable '{name}'")
-        places.append(Place(int(variable.valueReference), str(variable.type)))
+        place = Place(int(variable.valueReference), str(variable.type))
+        places.append(place)
     return tuple(places)
 
 
@@ -311,12 +337,14 @@ class _Bench:
     def instantiate(self) -> None:
         """Make a new instance, in place of the one before."""
         subject = self._subject
-        once = subject.fmu.description.coSimulation.canBeInstantiatedOnlyOncePerProcess
+        fmu = subject.fmu
+        once = fmu.description.coSimulation.canBeInstantiatedOnlyOncePerProcess
         if self._instance is not None and once:
             raise _CannotStartAgainError("it has one instance per process, which does not reset")
         self.close()
-        self._instance = interface(subject.fmu)(
-            subject.fmu,
+        make_instance = interface(fmu)
+        self._instance = make_instance(
+            fmu,
             subject.exchanged,
             subject.starts,
             subject.step,
@@ -386,12 +414,14 @@ class _Bench:
             # Times are multiples of the step, never sums of it.
             time = self._experiment.start_time + k * step
             states = tuple(fmi.take_step(time, size))
-            samples.append(ProbedStep(looked, states, tuple(fmi.read_outputs())))
+            outputs = tuple(fmi.read_outputs())
+            samples.append(ProbedStep(looked, states, outputs))
         return tuple(samples)
 
 
 def _same(one: ProbedRun | Sequence[ProbedStep], other: ProbedRun | Sequence[ProbedStep]) -> bool:
     """Whether two runs, or parts of them, have the same numbers; what was looked at is left out."""
+    # To the bit; an output that is no number yet is so in both.
     return np.array_equal(_all_numbers(one), _all_numbers(other), equal_nan=True)
 
 
@@ -414,7 +444,8 @@ HARDLY = 0.05
 
 def as_asked(asked: float, value: float) -> bool:
     """Whether an FMU has the number that it was given, within rounding of a float of 32 bits."""
-    return abs(asked - value) <= 1e-6 * max(abs(asked), abs(value))
+    scale = max(abs(asked), abs(value))
+    return abs(asked - value) <= 1e-6 * scale
 
 
 class Point(NamedTuple):
@@ -521,15 +552,16 @@ class Probe:
         inputs, _, _ = self.subject.exchanged
         for i, place in enumerate(inputs):
             # An integer has nothing between two values.
-            if place.type in REALS:
-                distance = high[i] - low[i]
-                high[i] = low[i] + share * distance
+            if place.type not in REALS:
+                continue
+            distance = high[i] - low[i]
+            high[i] = low[i] + share * distance
         self._low = low
         self._high = tuple(high)
         # Changes at most steps, and one input twice: an output that follows changes with it.
         self._inputs = (self._high, low, self._high, low, low, self._high)
         # Another first input.
-        self._other_inputs = (low, low, low, low, low, low)
+        self._other_inputs = (low,) * len(self._inputs)
         # Another third input.
         self._late_inputs = (self._high, low, low)
 
@@ -582,9 +614,11 @@ class Probe:
         seen = self._nothing_known(experiment)
         # A reset must repeat the first run to the bit, before any other run relies on it.
         try:
-            bench.resets = _same(bench.run(self._inputs, by_reset=True), first)
+            after_reset = bench.run(self._inputs, by_reset=True)
+            bench.resets = _same(after_reset, first)
         except PlantError as error:
             seen = seen._replace(failure=str(error))
+        # Each finding is kept as it is made: a later run may fail.
         try:
             if bench.resets:
                 seen = seen._replace(restart=Restart.RESET)
@@ -598,10 +632,15 @@ class Probe:
                     return seen._replace(failure=seen.failure or line)
             # FMI forbids it: an FMU may answer, and go on otherwise than it would have.
             looked = bench.run(self._inputs, look=True).samples
-            seen = seen._replace(harmless=_same(looked, first.samples))
-            kinds = self._kinds(bench, first, looked if seen.harmless else (), starts_alike)
-            seen = seen._replace(kinds=kinds, misset=self._misset(bench))
-            return seen._replace(keeps_to_step=self._keeps_to_step(bench, first))
+            harmless = _same(looked, first.samples)
+            seen = seen._replace(harmless=harmless)
+            # A look that changes what follows says nothing of the FMU without it.
+            usable = looked if harmless else ()
+            kinds = self._kinds(bench, first, usable, starts_alike)
+            misset = self._misset(bench)
+            seen = seen._replace(kinds=kinds, misset=misset)
+            keeps_to_step = self._keeps_to_step(bench, first)
+            return seen._replace(keeps_to_step=keeps_to_step)
         except _CannotStartAgainError as error:
             return seen._replace(restart=Restart.NEVER, failure=str(error))
         except PlantError as error:
@@ -614,24 +653,28 @@ class Probe:
         latter; one that goes by a step of its own, whatever it is told, neither.
         """
         half = self.subject.step / 2
+        same_twice = self._inputs[:1] * 2
         # An FMU that refuses half a step knows how long a step is.
         try:
-            halves = bench.run(self._inputs[:1] * 2, sizes=[half, half], spacing=half).samples
+            run = bench.run(same_twice, sizes=[half, half], spacing=half)
         except PlantError:
+            # A call that failed leaves an instance of which nothing is known.
             bench.instantiate()
             return True
-        whole = first.samples[0].states
-        return halves[0].states != whole or halves[1].states == whole
+        after_whole = first.samples[0].states
+        after_half, after_two_halves = (sample.states for sample in run.samples)
+        return after_half != after_whole or after_two_halves == after_whole
 
     def _misset(self, bench: _Bench) -> tuple[tuple[str, float, float], ...]:
         """Start values that the FMU did not take: name, what was asked for, what it has."""
-        present = bench.start().read_starts()
+        fmi = bench.start()
+        present = fmi.read_starts()
         subject = self.subject
         rows = []
         # The seed's words, which stand behind the named starts, are no values that one reads back.
-        for name, (_, asked), value in zip(
-            subject.start_names, subject.starts, present, strict=False
-        ):
+        for i, name in enumerate(subject.start_names):
+            _, asked = subject.starts[i]
+            value = present[i]
             if not as_asked(asked, value):
                 rows.append((name, asked, value))
         return tuple(rows)
@@ -647,7 +690,8 @@ class Probe:
 
         `looked` are the samples of `first` with a look after each set, if that is harmless.
         """
-        n_outputs = len(self.subject.names[1])
+        _, output_places, state_places = self.subject.exchanged
+        n_outputs = len(output_places)
         other = bench.run(self._other_inputs[:1], look=bool(looked))
         follows = [False] * n_outputs
         if looked:
@@ -655,17 +699,20 @@ class Probe:
             for i in range(n_outputs):
                 # It follows where it does so at the first sample and at a later one.
                 at_first = looked[0].looked[i] != other.samples[0].looked[i]
-                follows[i] = at_first and looked[2].looked[i] != late.samples[2].looked[i]
+                at_third = looked[2].looked[i] != late.samples[2].looked[i]
+                follows[i] = at_first and at_third
         points = [self._point(bench, first, 0)]
+        # At the first sample an output may be what the initialisation left.
         if self.subject.fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
             points.append(self._point(bench, first, 2))
         known_points = [point for point in points if point is not None]
         kinds = []
-        for i, place in enumerate(self.subject.exchanged[1]):
+        for i, place in enumerate(output_places):
             acts = first.samples[0].outputs[i] != other.samples[0].outputs[i]
             values = {sample.outputs[i] for sample in first.samples}
             changes = values != {first.outputs[i]}
-            if place in self.subject.exchanged[2]:
+            # A state needs no proof.
+            if place in state_places:
                 kinds.append(OutputKind.INSTANT)
             elif follows[i]:
                 kinds.append(OutputKind.FOLLOWS)
@@ -683,12 +730,16 @@ class Probe:
     ) -> Point | None:
         """Steps of other lengths from sample k on; None where the FMU refuses them."""
         step = self.subject.step
-        before = first.samples[k - 1] if k else ProbedStep((), first.states, first.outputs)
+        # Before the first sample there is what the initialisation left.
+        before = ProbedStep((), first.states, first.outputs)
+        if k > 0:
+            before = first.samples[k - 1]
 
         def under(values: tuple[float, ...], size: float) -> ProbedStep:
             inputs = (*self._inputs[:k], values)
             sizes = [step] * k + [size]
-            return bench.run(inputs, sizes=sizes).samples[k]
+            run = bench.run(inputs, sizes=sizes)
+            return run.samples[k]
 
         try:
             half = under(self._inputs[k], step / 2)
@@ -711,8 +762,11 @@ class Probe:
             order = Order.GET_SET_STEP
         else:
             return Reading(Order.SET_STEP_GET)
-        late = tuple(i for i, kind in enumerate(kinds) if kind in (*AFTER, OutputKind.OPEN))
-        return Reading(order, late)
+        late = []
+        for i, kind in enumerate(kinds):
+            if kind in AFTER or kind is OutputKind.OPEN:
+                late.append(i)
+        return Reading(order, tuple(late))
 
     @property
     def outputs(self) -> str | None:
@@ -720,7 +774,9 @@ class Probe:
         reading = self.reading
         if reading.late:
             return None
-        return "after-step" if reading.order is Order.SET_STEP_GET else "before-step"
+        if reading.order is Order.SET_STEP_GET:
+            return "after-step"
+        return "before-step"
 
     def stated(self, outputs: str) -> Reading:
         """The reading for a value of `plant.outputs`; raises PlantError where it was seen wrong."""
@@ -734,7 +790,9 @@ class Probe:
         if not fault and outputs == "before-step" and self.findings.harmless is False:
             fault = "a get after a set changes what follows"
         if fault:
-            cure = f'set it to "{self.outputs}"' if self.outputs else "leave it out"
+            cure = "leave it out"
+            if self.outputs:
+                cure = f'set it to "{self.outputs}"'
             raise PlantError(
                 f'plant.outputs = "{outputs}" does not fit FMU '
                 f"'{self.subject.fmu.path.name}': {fault}; {cure}"
@@ -756,10 +814,13 @@ class Probe:
             return (
                 f"{name} was given {start} = {asked:g} and has {value:g} after its initialisation"
             )
+        if findings.keeps_to_step:
+            return ""
+        # Its own step is known by its default experiment alone.
         default = self.subject.fmu.description.defaultExperiment
-        step = self.subject.step
         fixed = float(getattr(default, "stepSize", None) or 0.0)
-        if not findings.keeps_to_step and fixed and abs(step - fixed) > 1e-9 * fixed:
+        step = self.subject.step
+        if fixed and abs(step - fixed) > 1e-9 * fixed:
             return (
                 f"{name} goes equally far however long a step is told to be, and its own step is "
                 f"{fixed:g} s by its default experiment, not {step:g} s: set sampling_time or "
@@ -801,8 +862,12 @@ class Probe:
         bench.go_on(fmi, self._inputs[:1])
         states = tuple(fmi.states)
         fmi.save(bench.handle)
-        samples = bench.go_on(fmi, self._inputs[1:], first=1)
+        samples = self._go_on_from_saved(bench, fmi)
         return fmi, states, samples
+
+    def _go_on_from_saved(self, bench: _Bench, fmi: Instance) -> tuple[ProbedStep, ...]:
+        """The steps after the first one, behind which the state is saved."""
+        return bench.go_on(fmi, self._inputs[1:], first=1)
 
     def _try_snapshot(self, bench: _Bench) -> str:
         # What the same steps give where nothing is saved.
@@ -813,7 +878,9 @@ class Probe:
         fmi.load(bench.handle)
         if tuple(fmi.states) != states:
             return "a state that was saved and set again is another one"
-        if not _same(bench.go_on(fmi, self._inputs[1:], first=1), samples):
+        # What the FMU hides, its noise say, has to be in the saved state as well.
+        again = self._go_on_from_saved(bench, fmi)
+        if not _same(again, samples):
             return "after a state was saved and set again the same steps give other numbers"
         return ""
 
@@ -822,8 +889,8 @@ class Probe:
         data = fmi.serialise(bench.handle)
         fmi.deserialise(data, bench.handle)
         fmi.load(bench.handle)
-        same = tuple(fmi.states) == states
-        if not same or not _same(bench.go_on(fmi, self._inputs[1:], first=1), samples):
+        is_there = tuple(fmi.states) == states
+        if not is_there or not _same(self._go_on_from_saved(bench, fmi), samples):
             return "after a state was serialised and set again the same steps give other numbers"
         return ""
 
@@ -835,13 +902,16 @@ class Probe:
             bench.instantiate()
             # All actions low, then one of them high.
             rest = bench.run(self._other_inputs).samples
+            states_at_rest = [sample.states for sample in rest]
+            action_names, _, _ = self.subject.names
             names = {}
-            for i, name in enumerate(self.subject.names[0]):
+            for i, name in enumerate(action_names):
                 moved = list(self._low)
                 moved[i] = self._high[i]
-                samples = bench.run([tuple(moved)] * len(rest)).samples
+                inputs = [tuple(moved)] * len(rest)
+                samples = bench.run(inputs).samples
                 states = [sample.states for sample in samples]
-                if states == [sample.states for sample in rest]:
+                if states == states_at_rest:
                     names[name] = not _same(samples, rest)
             return names
         except PlantError:
@@ -896,21 +966,25 @@ def probe(
         # By name alone: `start_parameters` proves it, and needs a scenario.
         starts_anywhere = True
         for name in subject.names[2]:
-            if not has_start(fmu.variable(name)) and f"{name}_start" not in fmu.variables:
+            has_parameter = f"{name}_start" in fmu.variables
+            if not has_parameter and not has_start(fmu.variable(name)):
                 starts_anywhere = False
     return _as_report(probe_of(subject), starts_anywhere)
 
 
 def _undriven_inputs(subject: Subject) -> dict[str, str]:
     """Start values of the inputs that nobody sets, by name."""
-    places = {(place.reference, place.type, place.element) for place, _ in subject.starts}
+    actions, _, _ = subject.names
+    started = set()
+    for place, _ in subject.starts:
+        started.add((place.reference, place.type, place.element))
     undriven = {}
     for variable in subject.fmu.description.modelVariables:
-        if variable.causality != "input" or variable.name in subject.names[0]:
+        if variable.causality != "input" or variable.name in actions:
             continue
-        place = (int(variable.valueReference), str(variable.type), 0)
+        first_element = (int(variable.valueReference), str(variable.type), 0)
         # A scenario's parameter drives it, at one value.
-        if place not in places:
+        if first_element not in started:
             undriven[variable.name] = str(variable.start or "")
     return undriven
 
@@ -928,16 +1002,8 @@ def _as_report(seen: Probe, starts_anywhere: bool) -> ProbeReport:
         _ability_row("serialise", seen.serialises, "checkpoints of a training carry the plant"),
         _experiment_row(findings.experiment, subject.experiment),
         _still_row(seen.still),
-        Row(
-            "inputs that nobody drives",
-            ", ".join(f"{name} = {start or '?'}" for name, start in undriven.items()) or "none",
-            "they stay at their start values; plant.parameters may set them" if undriven else "",
-        ),
-        Row(
-            "start state",
-            "can be set" if starts_anywhere else "cannot be set",
-            "" if starts_anywhere else "episodes start where the FMU does",
-        ),
+        _undriven_row(undriven),
+        _start_row(starts_anywhere),
     ]
     if not findings.keeps_to_step:
         rows.append(
@@ -970,7 +1036,8 @@ def _outputs_row(seen: Probe, kinds: dict[str, OutputKind]) -> Row:
     if seen.outputs is None:
         return Row("outputs", said, "each is read where it belongs; leave plant.outputs out")
     order = f'plant.outputs = "{seen.outputs}"'
-    if not set(kinds.values()) & {*BEFORE, *AFTER}:
+    is_proven = any(kind in (*BEFORE, *AFTER) for kind in kinds.values())
+    if not is_proven:
         order += ", the order that FMI allows, without proof"
     if OutputKind.END in kinds.values():
         order += "; figures that need the cost at the sample's begin are refused"
@@ -987,10 +1054,30 @@ def _restart_row(findings: Findings) -> Row:
 
 
 def _still_row(still: dict[str, bool]) -> Row:
-    moves = {True: "moves outputs only", False: "moves nothing"}
-    names = "; ".join(f"{name} {moves[outputs]}" for name, outputs in still.items())
+    subject = "actions that move no state"
+    if not still:
+        return Row(subject, "none", "")
+    findings = []
+    for name, moves_output in still.items():
+        what = "outputs only" if moves_output else "nothing"
+        findings.append(f"{name} moves {what}")
     consequence = "no controller can act by them so: plant.parameters may set an input that enables"
-    return Row("actions that move no state", names or "none", consequence if still else "")
+    return Row(subject, "; ".join(findings), consequence)
+
+
+def _undriven_row(undriven: dict[str, str]) -> Row:
+    subject = "inputs that nobody drives"
+    if not undriven:
+        return Row(subject, "none", "")
+    pairs = [f"{name} = {start or '?'}" for name, start in undriven.items()]
+    consequence = "they stay at their start values; plant.parameters may set them"
+    return Row(subject, ", ".join(pairs), consequence)
+
+
+def _start_row(starts_anywhere: bool) -> Row:
+    if starts_anywhere:
+        return Row("start state", "can be set", "")
+    return Row("start state", "cannot be set", "episodes start where the FMU does")
 
 
 def _ability_row(
@@ -998,17 +1085,20 @@ def _ability_row(
     fault: str,
     use: str,
 ) -> Row:
-    return Row(subject, fault or "gives the same steps again", "not used" if fault else use)
+    if fault:
+        return Row(subject, fault, "not used")
+    return Row(subject, "gives the same steps again", use)
 
 
 def _experiment_row(experiment: Experiment, asked: Experiment) -> Row:
     stop = "none" if experiment.stop_time is None else f"{experiment.stop_time:g} s"
     tolerance = "none" if experiment.tolerance is None else f"{experiment.tolerance:g}"
-    needed = experiment.stop_time is not None and asked.stop_time is None
-    return Row(
-        "experiment",
-        f"start {experiment.start_time:g} s, stop {stop}, tolerance {tolerance}",
-        "it does not run without a stop time: no step goes beyond it, plant.stop_time sets another"
-        if needed
-        else "plant.start_time, plant.stop_time, plant.tolerance set others",
-    )
+    finding = f"start {experiment.start_time:g} s, stop {stop}, tolerance {tolerance}"
+    consequence = "plant.start_time, plant.stop_time, plant.tolerance set others"
+    # Nobody has asked for a stop time: it was found to be needed.
+    if experiment.stop_time is not None and asked.stop_time is None:
+        consequence = (
+            "it does not run without a stop time: no step goes beyond it, plant.stop_time sets "
+            "another"
+        )
+    return Row("experiment", finding, consequence)

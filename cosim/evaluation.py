@@ -144,28 +144,23 @@ def _measure_all(
     for name, description in named.items():
         source = ControllerSource.read(description) if isinstance(description, str) else description
         conditions = Conditions.of_now(scenario, description)
-        runs[name] = MeasureItem(conditions, source, noise, noise.length)
+        run = MeasureItem(conditions, source, noise, noise.length)
+        runs[name] = run
         # Built here once, so that a fault shows before any worker starts.
-        parameters[name] = parameters_hash(built(source, conditions.scenario))
+        controller = built(source, conditions.scenario)
+        parameters[name] = parameters_hash(controller)
+        # A factory is code of others, whatever its module.
         if conditions.all_ours and isinstance(description, str):
-            seconds[name] = runs[name].seconds_a_run()
+            seconds[name] = run.seconds_a_run()
+    # The columns are of what all have: versions, our code, scenario and FMU.
     facts = conditions.facts
-    n_seeds = len(noise.seeds)
     all_timed = len(seconds) == len(runs)
-    if all_timed and n_seeds * sum(seconds.values()) < WORKER_START:
+    total_seconds = len(noise.seeds) * sum(seconds.values())
+    if all_timed and total_seconds < WORKER_START:
         jobs = 1
     elif jobs is None:
         jobs = cores()
-    items: dict[tuple[str, int], MeasureItem] = {}
-    for name, run in runs.items():
-        if name in seconds:
-            size = int(ITEM_SECONDS / seconds[name]) + 1
-        else:
-            # Code of others may remember one run in the next, and may end its process: its items
-            # are always the same, and it is not run here to be timed.
-            size = max(1, ITEM_SAMPLES // noise.length)
-        for part in run.parts(min(n_seeds, size)):
-            items[name, part.noise.seeds[0]] = part
+    items = _split(runs, seconds)
     measured = {name: Measured() for name in named}
     n_done = 0
     total = len(named) * noise.samples
@@ -174,7 +169,7 @@ def _measure_all(
             # A mean over fewer seeds would be another figure under the same name.
             if isinstance(result, Failure):
                 raise result.error()
-            name = key[0]
+            name, _ = key
             measured[name].indicators.update(result.indicators)
             measured[name].timing.update(result.timing)
             n_done += items[key].noise.samples
@@ -204,9 +199,37 @@ def _measure_all(
     )
 
 
+def _split(
+    runs: Mapping[str, MeasureItem],
+    seconds: Mapping[str, float],
+) -> dict[tuple[str, int], MeasureItem]:
+    """Items of work of a few seeds each, by the controller's name and the first seed.
+
+    Args:
+        runs: each controller on all seeds, by its name.
+        seconds: time of a run on one seed, where it is known.
+    """
+    items = {}
+    for name, run in runs.items():
+        noise = run.noise
+        if name in seconds:
+            size = int(ITEM_SECONDS / seconds[name]) + 1
+        else:
+            # Code of others may remember one run in the next, and may end its process: its items
+            # are always the same, and it is not run here to be timed.
+            size = max(1, ITEM_SAMPLES // noise.length)
+        n_seeds = min(len(noise.seeds), size)
+        for part in run.parts(n_seeds):
+            first_seed = part.noise.seeds[0]
+            items[name, first_seed] = part
+    return items
+
+
 def _frame(rows: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> pd.DataFrame:
     """Rows by seed as a frame, in the order of the seeds."""
-    return pd.DataFrame.from_dict(rows, "index").reindex(list(seeds))
+    frame = pd.DataFrame.from_dict(rows, "index")
+    # Items end in any order.
+    return frame.reindex(list(seeds))
 
 
 def named_controllers(
@@ -229,15 +252,16 @@ def named_controllers(
                     f"a {type(controller).__name__}"
                 )
         return dict(controllers)
+    # A text is a sequence as well, of its letters.
     if isinstance(controllers, str) or not isinstance(controllers, Sequence):
         raise EvaluationError("controllers must be a list of names, or a mapping")
     named: dict[str, Factory | str] = {}
     for item in controllers:
         if not isinstance(item, str):
             raise EvaluationError(f"controllers: a {type(item).__name__} is no name")
-        name, equals, source = (part.strip() for part in item.partition("="))
-        if not equals:
-            source = name
+        before, equals, after = item.partition("=")
+        name = before.strip()
+        source = after.strip() if equals else name
         # A file of θ is called by its stem.
         if name.endswith(".toml"):
             name = Path(name).stem
@@ -254,10 +278,12 @@ def _distinct_seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
     numbers = _seed_numbers(seeds)
     if not numbers:
         raise EvaluationError("no seed to evaluate on; give at least one")
+    # A seed twice would count twice, and make an interval narrower than it is.
     if len(set(numbers)) < len(numbers):
         raise EvaluationError("seeds must be distinct")
-    if max(numbers) >= 1 << 64:
-        raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(numbers)}")
+    greatest = max(numbers)
+    if greatest >= 1 << 64:
+        raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {greatest}")
     return numbers
 
 
@@ -265,13 +291,18 @@ def _seed_numbers(seeds: int | Sequence[int]) -> tuple[int, ...]:
     """The seeds in their order, those below S for a number S."""
     # Texts and mappings can be iterated over, but are no lists of seeds; an array without
     # dimensions is a number.
-    no_list = isinstance(seeds, str | bytes | Mapping) or getattr(seeds, "ndim", 1) == 0
-    if no_list or not isinstance(seeds, Iterable):
-        count = whole_number("seeds", seeds, 1, EvaluationError)
-        if count > MOST_SEEDS:
-            raise EvaluationError(f"seeds must be at most {MOST_SEEDS}, not {count}")
-        return tuple(range(count))
-    return tuple(whole_number("a seed", seed, 0, EvaluationError) for seed in seeds)
+    is_text_or_table = isinstance(seeds, str | bytes | Mapping)
+    is_number = getattr(seeds, "ndim", 1) == 0
+    if isinstance(seeds, Iterable) and not is_text_or_table and not is_number:
+        numbers = []
+        for seed in seeds:
+            number = whole_number("a seed", seed, 0, EvaluationError)
+            numbers.append(number)
+        return tuple(numbers)
+    count = whole_number("seeds", seeds, 1, EvaluationError)
+    if count > MOST_SEEDS:
+        raise EvaluationError(f"seeds must be at most {MOST_SEEDS}, not {count}")
+    return tuple(range(count))
 
 
 def _check_names(controllers: Mapping[str, Factory | str]) -> None:
@@ -314,7 +345,8 @@ class Evaluation(Result):
             "seeds": len(self.seeds),
         }
         for name in self.controllers:
-            facts[f"J of {name}"] = float(self.column(name, "J").mean())
+            cost = self.column(name, "J")
+            facts[f"J of {name}"] = float(cost.mean())
         if self.optimum is not None:
             facts["J*"] = float(self.optimal.mean())
         return facts
@@ -348,7 +380,9 @@ class Evaluation(Result):
             raise EvaluationError(f"there is no '{controller}'{instead(controller, self.columns)}")
         frame = self.columns[controller]
         if name not in frame:
-            raise EvaluationError(f"there is no '{name}'{instead(name, map(str, frame))}")
+            # Iteration over a frame gives its titles.
+            titles = [str(title) for title in frame]
+            raise EvaluationError(f"there is no '{name}'{instead(name, titles)}")
         return np.asarray(frame[name])
 
     @property
@@ -374,36 +408,44 @@ class Evaluation(Result):
         frame = frame.assign(**self.facts)
         frame["parameters_hash"] = frame.controller.map(self.parameters)
         cost = frame.J.to_numpy()
-        # The rows of all controllers are on the same seeds, one controller after the other.
-        repeats = len(self.controllers)
-        naive = np.tile(self._cost(NAIVE), repeats)
-        optimal = np.tile(self._cost(OPTIMAL), repeats)
-        reference = np.tile(self._cost(self.reference), repeats)
+        optimal = self._cost_for_rows(OPTIMAL)
+        naive = self._cost_for_rows(NAIVE)
+        reference = self._cost_for_rows(self.reference)
         frame["regret"] = statistics.regrets(cost, optimal)
         frame["gap_closed"] = statistics.gaps_closed(cost, naive, optimal)
         frame["gain_in_J"] = statistics.gains(cost, reference)
-        return frame[EVALUATION_COLUMNS].astype({"failures": int})
+        table = frame[EVALUATION_COLUMNS]
+        # A count, which stands among real numbers in a run's figures.
+        return table.astype({"failures": int})
+
+    def _cost_for_rows(self, controller: str) -> Array:
+        """J of a controller on the seed of each row of the table."""
+        # The rows of all controllers are on the same seeds, one controller after the other.
+        return np.tile(self._cost(controller), len(self.controllers))
 
     def _rows(self, frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
         """Frames of the controllers one below the other, with controller and seed as columns."""
         # The optimum's frame may be there without being asked for.
         asked_for = {name: frames[name] for name in self.controllers}
         rows = pd.concat(asked_for)
-        return rows.rename_axis(["controller", "seed"]).reset_index()
+        named = rows.rename_axis(["controller", "seed"])
+        return named.reset_index()
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
-        return str(self.to_pandas().to_csv(index=False, lineterminator="\n"))
+        table = self.to_pandas()
+        return str(table.to_csv(index=False, lineterminator="\n"))
 
     def figure(self) -> Figure:
         """Regret (J where J* is not known) with its intervals; economic cost against violation."""
         from cosim.figures.evaluation import evaluation_figure  # noqa: PLC0415 - matplotlib
 
         columns = {name: self.columns[name] for name in self.controllers}
+        scenario = self.facts["scenario"]
         runs = f"{self.facts['steps']} samples × {len(self.seeds)} seeds"
         return evaluation_figure(
             columns,
-            title=f"{self.facts['scenario']}, {runs}, the same disturbances for all",
+            title=f"{scenario}, {runs}, the same disturbances for all",
             optimal=None if self.optimum is None else self.optimal,
         )
 
@@ -412,8 +454,9 @@ class Evaluation(Result):
         names = ["J", "regret", "economic_cost", "violating_share", "failures"]
         by_controller = self.to_pandas().groupby("controller", sort=False)
         means = by_controller[names].mean()
-        texts = means.map("{:.6g}".format).reset_index()
-        return markdown_table(("controller", *names), texts.to_numpy().tolist())
+        texts = means.map("{:.6g}".format)
+        rows = texts.reset_index().to_numpy().tolist()
+        return markdown_table(("controller", *names), rows)
 
     def write(self, folder: str | Path) -> None:
         """Write evaluation.csv, evaluation.png, timing.csv and scenario.toml, all or none."""
@@ -424,7 +467,9 @@ class Evaluation(Result):
         """Write the files of `write` one after the other."""
         self.plot(folder / "evaluation.png")
         (folder / "scenario.toml").write_text(self.scenario.to_toml(), "utf-8")
-        tables = {EVALUATION: self.to_pandas(), TIMING: self._rows(self.timing).round(3)}
+        # Times of a clock have no more digits that mean anything.
+        timing = self._rows(self.timing).round(3)
+        tables = {EVALUATION: self.to_pandas(), TIMING: timing}
         for name, table in tables.items():
             # Write row by row: the text of all takes ten times the memory of the numbers.
             table.to_csv(folder / name, index=False, lineterminator="\n")
@@ -449,10 +494,17 @@ class Evaluation(Result):
             document["remark"] = SAME_RUNS_NOTE
         document["reference"] = self.reference
         document["optimum"] = self.optimum
-        document["optimal_J"] = None if self.optimum is None else float(np.mean(self.optimal))
-        document["controllers"] = {name: self._controller(name) for name in self.controllers}
+        document["optimal_J"] = None
+        if self.optimum is not None:
+            document["optimal_J"] = float(np.mean(self.optimal))
+        controllers = {}
+        # Medians over the seeds: one run that the machine held up does not count.
+        medians = {}
+        for name in self.controllers:
+            controllers[name] = self._controller(name)
+            medians[name] = self.timing[name].median().to_dict()
+        document["controllers"] = controllers
         document["comparisons"] = comparisons
-        medians = {name: self.timing[name].median().to_dict() for name in self.controllers}
         document["timing"] = medians
         return document
 
@@ -461,22 +513,27 @@ class Evaluation(Result):
         document: dict[str, Any] = {}
         intervals = {}
         for indicator in MEANS:
-            estimate = statistics.mean(self.column(name, indicator))
+            values = self.column(name, indicator)
+            estimate = statistics.mean(values)
             document[indicator] = estimate.value
             intervals[indicator] = {"interval": estimate.interval}
-        document["failures"] = int(np.sum(self.column(name, "failures")))
+        failures = self.column(name, "failures")
+        document["failures"] = int(np.sum(failures))
         document["parameters_hash"] = self.parameters[name]
         document["intervals"] = intervals
         if self.optimum is None:
             return document
         cost = self._cost(name)
         optimal = self.optimal
+        regret = statistics.regret(cost, optimal)
+        size = statistics.magnitude(optimal)
         document["regret"] = {
-            **statistics.regret(cost, optimal)._asdict(),
-            "bootstrap": statistics.bootstrapped(cost - optimal, statistics.magnitude(optimal)),
+            **regret._asdict(),
+            "bootstrap": statistics.bootstrapped(cost - optimal, size),
         }
         if NAIVE in self.controllers:
-            gap_closed = statistics.gap_closed(cost, self._cost(NAIVE), optimal)
+            naive = self._cost(NAIVE)
+            gap_closed = statistics.gap_closed(cost, naive, optimal)
             document["gap_closed"] = gap_closed._asdict()
         return document
 
@@ -484,17 +541,22 @@ class Evaluation(Result):
         """Paired differences of two controllers, for the summary."""
         differences = {}
         for indicator in COMPARED:
-            difference = self.column(name, indicator) - self.column(reference, indicator)
-            differences[indicator] = statistics.mean(difference)._asdict()
+            values = self.column(name, indicator)
+            others = self.column(reference, indicator)
+            # Seed by seed: the noise that both met cancels.
+            estimate = statistics.mean(values - others)
+            differences[indicator] = estimate._asdict()
         cost = self._cost(name)
         other = self._cost(reference)
+        gain = statistics.gain(cost, other)
+        size = statistics.magnitude(other)
         return {
             "controller": name,
             "reference": reference,
             "differences": differences,
             "gain_in_J": {
-                **statistics.gain(cost, other)._asdict(),
-                "bootstrap": statistics.bootstrapped(other - cost, statistics.magnitude(other)),
+                **gain._asdict(),
+                "bootstrap": statistics.bootstrapped(other - cost, size),
             },
         }
 
@@ -527,10 +589,12 @@ class _Recorded:
 
     def feedback(self, s: Array, a: object = None) -> Decision:
         """The sample's action; raises EvaluationError if the state belongs to other noise."""
-        for (name, column), expected in zip(self._states.items(), s.tolist(), strict=True):
+        pairs = zip(self._states.items(), s.tolist(), strict=True)
+        for (name, column), expected in pairs:
             recorded = float(column.iloc[self._k])
+            allowed = TOLERANCE * (1 + abs(expected))
             # Written so that no number is refused, too.
-            if not abs(recorded - expected) <= TOLERANCE * (1 + abs(expected)):
+            if not abs(recorded - expected) <= allowed:
                 raise EvaluationError(
                     f"'{self._path}': {name} at sample {self._k} is {recorded!r}; the seed's noise "
                     f"under these actions gives {expected!r} (cosim scenario NAME --seed-values K "
@@ -584,7 +648,10 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
             other = played.setdefault(content, path)
             if other != path:
                 raise EvaluationError(f"'{path}' holds the same run as '{other}': give it once")
-            cost = np.nan if optimum is None else measure(plant, optimum, seed, steps)[0]["J"]
+            cost = np.nan
+            if optimum is not None:
+                of_optimum, _ = measure(plant, optimum, seed, steps)
+                cost = of_optimum["J"]
             rows.append(
                 {
                     "file": path.name,
@@ -597,7 +664,9 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
                 }
             )
     table = pd.DataFrame(rows).sort_values("seed", ignore_index=True)
-    table["regret"] = statistics.regrets(table.J.to_numpy(), table.optimum.to_numpy())
+    costs = table.J.to_numpy()
+    optima = table.optimum.to_numpy()
+    table["regret"] = statistics.regrets(costs, optima)
     return table
 
 
@@ -605,13 +674,14 @@ def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) ->
     """Refuse runs whose mean would count a seed twice or short runs like long ones."""
     seeds: dict[int, Path] = {}
     first = next(iter(runs))
+    _, _, first_steps = runs[first]
     for path, (seed, _, steps) in runs.items():
         other = seeds.setdefault(seed, path)
         if other != path:
             raise EvaluationError(f"'{path}' and '{other}' are both of seed {seed}: give one")
-        if steps != runs[first][2]:
+        if steps != first_steps:
             raise EvaluationError(
-                f"'{path}' has {steps} samples, '{first}' {runs[first][2]}: runs that are "
+                f"'{path}' has {steps} samples, '{first}' {first_steps}: runs that are "
                 "averaged must have the same length; cut them, or judge them in two folders"
             )
 
@@ -637,15 +707,18 @@ def _read_trajectory(path: Path, scenario: Scenario) -> tuple[int, _Recorded, in
         raise EvaluationError(f"'{path}' is no trajectory: {reason}") from None
     # A simulation would clip them, and judge another run than the file's.
     actions = numbers[list(plant.actions)].to_numpy()
+    steps = len(actions)
     above = actions >= scenario.action_lower
     below = actions <= scenario.action_upper
     # A missing one is no number, and so neither.
     inside = (above & below).all(axis=1)
-    if not len(actions) or not inside.all():
-        k = int(np.argmin(inside)) if len(actions) else 0
+    if steps == 0 or not inside.all():
+        # The first that is not; a file without rows lacks that of sample 0.
+        k = int(np.argmin(inside)) if steps else 0
         raise EvaluationError(f"'{path}': the action at sample {k} is missing or beyond its bounds")
-    player = _Recorded(path, numbers[list(plant.states)], actions)
-    return seed, player, len(actions)
+    states = numbers[list(plant.states)]
+    player = _Recorded(path, states, actions)
+    return seed, player, steps
 
 
 def _seed_of_file(path: Path) -> int:

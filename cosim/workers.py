@@ -43,8 +43,10 @@ class Failure:
 
     def error(self) -> Exception:
         """The error once more; an EvaluationError for that of a plug-in."""
+        # Made of its message alone; a class with arguments of its own cannot be made again.
         if self.kind is not None and self.kind.__init__ is Exception.__init__:
-            return self.kind(self.message.partition(": ")[2])
+            _, _, words = self.message.partition(": ")
+            return self.kind(words)
         return EvaluationError(self.message)
 
 
@@ -68,7 +70,10 @@ class Conditions:
 
     @classmethod
     def of_now(
-        cls, scenario: Scenario, *parts: Any, files: Mapping[str, str] | None = None
+        cls,
+        scenario: Scenario,
+        *parts: Any,
+        files: Mapping[str, str] | None = None,
     ) -> Self:
         """The conditions as this process finds them now; raises what `depends_on` raises.
 
@@ -77,11 +82,19 @@ class Conditions:
             parts: controllers and algorithms that count.
             files: paths of the data files that count, by name.
         """
-        if is_file(scenario.plant.fmu):
-            fmu = str(Path(scenario.plant.fmu).resolve())
-            scenario = scenario.replace({"plant": {"fmu": fmu}})
+        fmu = scenario.plant.fmu
+        # A worker may have another working directory.
+        if is_file(fmu):
+            absolute = str(Path(fmu).resolve())
+            scenario = scenario.replace({"plant": {"fmu": absolute}})
         facts = depends_on(scenario, *parts, files=files)
-        return cls(scenario, facts, parts, files or {}, import_folders())
+        return cls(
+            scenario=scenario,
+            facts=facts,
+            parts=parts,
+            files=files or {},
+            folders=import_folders(),
+        )
 
     @property
     def all_ours(self) -> bool:
@@ -150,13 +163,20 @@ def perform(item: Item[Outcome]) -> Report[Outcome]:
     except (KeyboardInterrupt, Terminated):
         raise
     except BaseException as error:
-        name = type(error).__name__
-        text = " ".join(f"{error}".split()) or name
-        kind: type[Exception] | None = None
-        # Classes of others need not be there where the error is raised again.
-        if isinstance(error, Exception) and type(error).__module__.partition(".")[0] in OURS:
-            kind = type(error)
-        return Report(facts, Failure(f"{name}: {text}", traceback.format_exc(), kind))
+        return Report(facts, _failure(error))
+
+
+def _failure(error: BaseException) -> Failure:
+    """An exception that is handled now as a Failure, which any process can read."""
+    name = type(error).__name__
+    words = str(error).split()
+    text = " ".join(words) or name
+    package, _, _ = type(error).__module__.partition(".")
+    kind: type[Exception] | None = None
+    # Classes of others need not be there where the error is raised again.
+    if isinstance(error, Exception) and package in OURS:
+        kind = type(error)
+    return Failure(f"{name}: {text}", traceback.format_exc(), kind)
 
 
 def done(
@@ -188,12 +208,13 @@ def done(
         try:
             with closing(_reports(remaining, jobs, scheduler)) as reports:
                 for key, report in reports:
-                    conditions = remaining.pop(key).conditions
+                    item = remaining.pop(key)
                     fruitless = 0
-                    if isinstance(report.result, Failure):
-                        yield key, report.result
-                    else:
-                        yield key, conditions.refusal(report.facts) or report.result
+                    result = report.result
+                    if not isinstance(result, Failure):
+                        refusal = item.conditions.refusal(report.facts)
+                        result = refusal or result
+                    yield key, result
         # A worker was killed, for want of memory say: what it left is given out again.
         except BrokenProcessPool as error:
             if fruitless == ROUNDS:
@@ -232,19 +253,31 @@ def _reports(
         yield from _on_cluster(scheduler, items)
         return
     if jobs == 1:
-        yield from (_with_key(key, item) for key, item in list(items.items()))
+        # A list: the caller removes each item as it is done.
+        for key, item in list(items.items()):
+            yield _with_key(key, item)
         return
     import loky  # noqa: PLC0415 - a third of a second, which work in this process need not take
 
     # The workers are as many as the cores: more threads would wait for each other.
-    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    one_thread = {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+    }
     workers = loky.ProcessPoolExecutor(
-        min(jobs, len(items)), initializer=begin_worker, initargs=(os.getpid(),), env=one_thread
+        max_workers=min(jobs, len(items)),
+        initializer=begin_worker,
+        initargs=(os.getpid(),),
+        env=one_thread,
     )
     try:
+        futures = []
+        # The workers start with the first item that is given out.
         with without_interrupts():
-            ended = [workers.submit(_with_key, *pair) for pair in items.items()]
-        for future in loky.as_completed(ended):
+            for key, item in items.items():
+                futures.append(workers.submit(_with_key, key, item))
+        for future in loky.as_completed(futures):
             yield future.result()
     finally:
         workers.shutdown(wait=True, kill_workers=True)
@@ -274,16 +307,23 @@ def _on_cluster(
             raise OSError("what answers is no scheduler")
         client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
         try:
-            for future in client.map(_with_key, *zip(*items.items(), strict=True), pure=False):
+            # Not pure: Dask would hand out what it remembers of an equal item.
+            futures = client.map(_with_key, list(items), list(items.values()), pure=False)
+            for future in futures:
                 future.add_done_callback(ended.put)
             for _ in range(len(items)):
                 yield _next_ended(dask, address, ended).result()
         finally:
+            # What ended the work is what the user has to know.
             with suppress(Exception):
                 client.close(timeout=ANSWER_SECONDS)
     except Exception as error:
-        text = f"no answer within {ANSWER_SECONDS:g} s" if type(error) is TimeoutError else error
-        reason = " ".join(str(text).split())[:300] or type(error).__name__
+        text = str(error)
+        # asyncio's own has no words.
+        if type(error) is TimeoutError:
+            text = f"no answer within {ANSWER_SECONDS:g} s"
+        one_line = " ".join(text.split())
+        reason = one_line[:300] or type(error).__name__
         raise EvaluationError(
             f"the Dask cluster at '{address}' failed: {reason}; give the same command again, with "
             "the same rti-cosim and what the items need on all workers"
@@ -302,7 +342,11 @@ def _next_ended(
     while True:
         with suppress(Empty):
             return ended.get(timeout=ANSWER_SECONDS)
-        waited = 0.0 if _identity(dask, address)["workers"] else waited + ANSWER_SECONDS
+        # While there are workers an item may take as long as it likes.
+        if _identity(dask, address)["workers"]:
+            waited = 0.0
+        else:
+            waited += ANSWER_SECONDS
         if waited > WORKER_SECONDS:
             raise OSError(f"it has had no worker for {WORKER_SECONDS:g} s")
 
@@ -312,12 +356,14 @@ def _identity(dask: Any, address: str) -> dict[str, Any]:
     import asyncio  # noqa: PLC0415 - of no use to a worker
 
     async def ask() -> dict[str, Any]:
+        # The user's certificates, if Dask is configured with any.
         security = dask.Security().get_connection_args("client")
         async with (
             asyncio.timeout(ANSWER_SECONDS),
             dask.rpc(address, connection_args=security) as scheduler,
         ):
-            return dict(await scheduler.identity())
+            identity = await scheduler.identity()
+            return dict(identity)
 
     return _in_a_thread(lambda: asyncio.run(ask()))
 

@@ -53,10 +53,14 @@ def _load_recording(path: Path) -> RunSignals:
     from cosim.recording.read import read_recording  # noqa: PLC0415 - half a second
 
     recording = read_recording(path)
+    clock_names = clocked()
     signals = {}
     for name, values in recording.signals.items():
-        if values.ndim == 1 and name not in clocked():
-            signals[name] = Signal(name, recording.units[name], values)
+        # A prediction has an axis of its own.
+        if values.ndim != 1 or name in clock_names:
+            continue
+        unit = recording.units[name]
+        signals[name] = Signal(name, unit, values)
     return RunSignals(str(path), signals, recording.status, ordered=False)
 
 
@@ -84,8 +88,12 @@ class Difference:
 
     def text(self) -> str:
         """Largest difference and tolerance, with units and both values."""
+        # "1" is FMI's unit of a number without dimension.
         unit = "" if self.unit in ("", "1") else f" {self.unit}"
-        beyond = "" if self.tolerance is None else f", tolerance {self.tolerance:.6g}{unit}"
+        beyond = ""
+        if self.tolerance is not None:
+            beyond = f", tolerance {self.tolerance:.6g}{unit}"
+        # `repr`: where single bits differ fewer digits would show two equal numbers.
         return (
             f"{self.name} differs by up to {self.maximum:.6g}{unit} "
             f"(sample {self.at}: {self.a!r} against {self.b!r}){beyond}"
@@ -123,9 +131,10 @@ class Comparison:
     @property
     def first(self) -> int | None:
         """First sample at which any signal or the status differs."""
-        samples = [difference.first for difference in self.differences]
-        samples.append(self.status)
-        return min((sample for sample in samples if sample is not None), default=None)
+        candidates = [difference.first for difference in self.differences]
+        candidates.append(self.status)
+        samples = [sample for sample in candidates if sample is not None]
+        return min(samples, default=None)
 
     def lines(self) -> list[str]:
         """The differences in words: the first one, then names, units and order."""
@@ -148,7 +157,10 @@ class Comparison:
         sample = self.first
         if sample is None:
             return []
-        time = f" (time {self.times[sample]:g} s)" if len(self.times) > sample else ""
+        time = ""
+        # A run of another tool may have no column of times.
+        if len(self.times) > sample:
+            time = f" (time {self.times[sample]:g} s)"
         lines = [f"first difference at sample {sample}{time}:"]
         for difference in self.differences:
             if difference.first == sample:
@@ -269,8 +281,10 @@ def _difference(
     first = _first(beyond)
     if not count:
         return Difference(a.name, a.unit, tolerance, 0.0, 0, np.nan, np.nan, first)
+    at = int(np.argmax(distance))
     # −0.0 and 0.0 differ in their bits, by no distance.
-    at = int(np.argmax(distance)) if distance.max() > 0 else first or 0
+    if distance[at] == 0:
+        at = first or 0
     return Difference(
         name=a.name,
         unit=a.unit,

@@ -50,16 +50,16 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     ) -> None:
         self.render_mode = render_mode
         self._plant = FmuPlant(scenario)
-        if self.scenario.signals:
-            name = self.scenario.name
+        task = self.scenario
+        if task.signals:
             self._plant.close()
             raise PlantError(
-                f"scenario '{name}' has signals, which an observation does not have yet: use "
+                f"scenario '{task.name}' has signals, which an observation does not have yet: use "
                 "cosim.simulate"
             )
         # The FMU's own ranges of its states.
         low, high = self._plant.state_range
-        sensors = self.scenario.sensors or ()
+        sensors = task.sensors or ()
         n_sensors = len(sensors)
         if sensors:
             # Readings have noise without bounds; the age of one that never came is −1.
@@ -67,14 +67,16 @@ class PlantEnv(gymnasium.Env[Array, Array]):
             least_age = np.full(n_sensors, -1.0)
             low = np.concatenate([least_reading, least_age])
             high = np.full(2 * n_sensors, np.inf)
-        self._delays: Array = np.array([sensor.delay for sensor in sensors], dtype=float)
+        self.observation_space = Box(low, high, dtype=np.float64)
+        delays = [sensor.delay for sensor in sensors]
+        self._delays: Array = np.array(delays, dtype=float)
         self._last_readings: Array = np.zeros(n_sensors)
         self._ages: Array = np.full(n_sensors, -1.0)
-        self.observation_space = Box(low, high, dtype=np.float64)
         # Gymnasium may write to its arrays, a scenario's are read-only.
-        lower = self.scenario.action_lower.copy()
-        upper = self.scenario.action_upper.copy()
+        lower = task.action_lower.copy()
+        upper = task.action_upper.copy()
         self.action_space = Box(lower, upper, dtype=np.float64)
+        # For pictures alone; one state more than actions, that before the first of them.
         self._states: deque[Array] = deque(maxlen=SAMPLES_SHOWN + 1)
         self._actions: deque[Array] = deque(maxlen=SAMPLES_SHOWN)
 
@@ -84,7 +86,10 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         return self._plant.scenario
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode.
 
@@ -113,7 +118,8 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         self._states.append(s)
         self._last_readings = np.zeros_like(self._last_readings)
         self._ages = np.full_like(self._ages, -1.0)
-        return self._observation(s, self._plant.y), {}
+        observation = self._observation(s, self._plant.y)
+        return observation, {}
 
     def _observation(self, s: Array, y: Array | None) -> Array:
         """The state (n,); under sensors the last readings and their ages, (2·n_y,)."""
@@ -132,18 +138,24 @@ class PlantEnv(gymnasium.Env[Array, Array]):
 
         Raises PlantError on another shape: NumPy would spread one number over all inputs.
         """
-        if np.shape(action) != self.action_space.shape:
-            raise PlantError(
-                f"an action has shape {self.action_space.shape}, not {np.shape(action)}"
-            )
+        shape = np.shape(action)
+        if shape != self.action_space.shape:
+            raise PlantError(f"an action has shape {self.action_space.shape}, not {shape}")
         applied = self.scenario.saturate(action)
         s, stage_cost, penalty, disturbance, y = self._plant.step(applied)
-        info = {"stage_cost": stage_cost, "penalty": penalty, "disturbance": disturbance}
+        info = {
+            "stage_cost": stage_cost,
+            "penalty": penalty,
+            "disturbance": disturbance,
+        }
         self._states.append(s)
         self._actions.append(applied)
         observation = self._observation(s, y)
         reward = -(stage_cost + penalty)
-        return observation, reward, False, False, info
+        # A task of operation has no end of its own.
+        terminated = False
+        truncated = False
+        return observation, reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the last samples as an RGB image (height, width, 3); None without a render mode."""
@@ -152,12 +164,14 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         # Import Matplotlib only where a picture is asked for.
         from cosim.figures.trajectory import episode_image  # noqa: PLC0415
 
-        first = self._plant.k - len(self._actions)
-        n_actions = len(self.scenario.plant.actions)
+        n_shown = len(self._actions)
+        first = self._plant.k - n_shown
         states = np.array(self._states)
         # Right after a reset there is no action, and the array has one axis.
-        actions = np.array(self._actions).reshape(-1, n_actions)
-        return episode_image(self.scenario, self._plant.units, first, states, actions)
+        n_actions = len(self.scenario.plant.actions)
+        actions = np.array(self._actions).reshape(n_shown, n_actions)
+        units = self._plant.units
+        return episode_image(self.scenario, units, first, states, actions)
 
     def close(self) -> None:
         """Free the plant."""
@@ -209,7 +223,10 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         return scaled.astype(np.float32)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Single, dict[str, Any]]:
         """Start an episode, as `PlantEnv.reset` does.
 
@@ -230,12 +247,14 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         # An agent's noise may carry it beyond; the actuators saturate.
         clipped = np.clip(values, -1.0, 1.0)
         share = 0.5 * (clipped + 1.0)
-        physical = lower + share * (upper - lower)
+        width = upper - lower
+        physical = lower + share * width
         s, reward, terminated, truncated, info = self.env.step(physical)
         # The reward is minus the cost: its excess is counted from the operating point's.
         excess = self.reference_cost + float(reward)
         scaled = excess / self.cost_scale
-        return self._normalised(s), scaled, terminated, truncated, info
+        observation = self._normalised(s)
+        return observation, scaled, terminated, truncated, info
 
 
 _ENVIRONMENTS = {

@@ -27,7 +27,9 @@ _data: dict[str, str] = {}
 
 
 def depends_on(
-    scenario: Scenario, *parts: Any, files: Mapping[str, str | Path] | None = None
+    scenario: Scenario,
+    *parts: Any,
+    files: Mapping[str, str | Path] | None = None,
 ) -> dict[str, str]:
     """All that a result depends on, by name: versions as text, everything else as hashes.
 
@@ -46,13 +48,17 @@ def depends_on(
         ControllerLookupError: a part cannot be imported.
         PlantError: the FMU cannot be read.
     """
+    files = files or {}
     data = {}
-    for name, path in (files or {}).items():
-        data[name] = file_hash(path) or "no file"
-        if _data.setdefault(str(path), data[name]) != data[name]:
-            _data[str(path)] = data[name]
+    for name, path in files.items():
+        present = file_hash(path) or "no file"
+        seen_last = _data.get(str(path), present)
+        if seen_last != present:
             # They may have read it while they were imported.
             forget_users_modules()
+        _data[str(path)] = present
+        data[name] = present
+    # After the files: the code is that of modules as they are loaded from now on.
     facts = {
         "versions": versions(),
         "rti-cosim": code_hash(),
@@ -75,6 +81,7 @@ def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
         before: an answer.
         now: a later one.
     """
+    # What is in one of them alone differs, too.
     names = sorted({*before, *now})
     return [name for name in names if before.get(name) != now.get(name)]
 
@@ -87,11 +94,17 @@ def _modules_of(part: Any) -> list[str]:
     while isinstance(part, partial):
         part = part.func
     if not isinstance(part, str):
-        return [getattr(part, "__module__", None) or type(part).__module__]
+        # A callable object has no module of its own.
+        home = getattr(part, "__module__", None) or type(part).__module__
+        return [home]
     by_name = registered(ALGORITHMS) | registered(CONTROLLERS)
     target = by_name.get(part, part)
-    module = target.partition(":")[0]
-    if not TARGET.fullmatch(target) or module.partition(".")[0] in OURS:
+    # A file of θ is no code.
+    if not TARGET.fullmatch(target):
+        return []
+    module, _, _ = target.partition(":")
+    package, _, _ = module.partition(".")
+    if package in OURS:
         return []
     plugin = load_plugin(target, f"'{part}'", ControllerLookupError)
     # A module may only import what another one defines.
@@ -102,9 +115,10 @@ def _modules_of(part: Any) -> list[str]:
 def file_hash(path: str | Path) -> str:
     """SHA-256 of a file, empty where there is none."""
     try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        content = Path(path).read_bytes()
     except OSError:
         return ""
+    return hashlib.sha256(content).hexdigest()
 
 
 @cache
@@ -125,13 +139,18 @@ def code_hash() -> str:
     """
     digest = hashlib.sha256()
     for package in OURS:
-        for path in sorted((ROOT / package).rglob("*")):
+        folder = ROOT / package
+        # Sorted: a file system gives the entries of a folder in any order.
+        for path in sorted(folder.rglob("*")):
             relative = path.relative_to(ROOT)
-            is_aside = bool(ASIDE & set(relative.parts))
-            if is_aside or path.suffix not in CODE_SUFFIXES or not path.is_file():
+            # What only draws, prints or records may change without a new result.
+            if not ASIDE.isdisjoint(relative.parts):
+                continue
+            if path.suffix not in CODE_SUFFIXES or not path.is_file():
                 continue
             # The name counts, too: a module is found by it.
+            name = relative.as_posix()
             content = hashlib.sha256(path.read_bytes())
-            digest.update(f"{relative.as_posix()}\0".encode())
+            digest.update(f"{name}\0".encode())
             digest.update(content.digest())
     return digest.hexdigest()[:16]

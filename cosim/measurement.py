@@ -88,7 +88,8 @@ class MeasureItem(Item[Measured]):
         noise = self.noise
         controller = self._built()
         measured = Measured()
-        with FmuPlant(self.plant or self.conditions.scenario) as plant:
+        scenario = self.plant or self.conditions.scenario
+        with FmuPlant(scenario) as plant:
             if noise.whole:
                 run = simulate(plant, controller, noise.steps, noise.seeds[0])
                 return Measured(trajectory=run.to_csv())
@@ -102,7 +103,8 @@ class MeasureItem(Item[Measured]):
         """Items of so many seeds each, the last of the rest."""
         seeds = self.noise.seeds
         for first in range(0, len(seeds), n_seeds):
-            noise = self.noise._replace(seeds=seeds[first : first + n_seeds])
+            part = seeds[first : first + n_seeds]
+            noise = self.noise._replace(seeds=part)
             yield replace(self, noise=noise)
 
     def seconds_a_run(self) -> float:
@@ -110,32 +112,38 @@ class MeasureItem(Item[Measured]):
 
         Raises what building and running the controller raises.
         """
+        length = self.noise.length
         seed = self.noise.seeds[0]
-        steps = min(PROBE_STEPS, self.noise.length)
+        steps = min(PROBE_STEPS, length)
         while True:
-            probe = replace(self, noise=Noise((seed,), steps))
+            noise = Noise((seed,), steps)
+            probe = replace(self, noise=noise)
             result = perform(probe).result
             if isinstance(result, Failure):
                 raise result.error()
             seconds = result.timing[seed]["wall_time_s"]
-            if seconds > PROBE_SECONDS or steps == self.noise.length:
-                return seconds / steps * self.noise.length
-            steps = min(5 * steps, self.noise.length)
+            if seconds > PROBE_SECONDS or steps == length:
+                return seconds / steps * length
+            steps = min(5 * steps, length)
 
     def _built(self) -> Controller:
         """The controller, compiled where its runs are long."""
         if not isinstance(self.controller, ControllerSource):
             return self._new()
-        key = repr((self.controller, sorted(self.conditions.facts.items()), self.length))
+        facts = sorted(self.conditions.facts.items())
+        key = repr((self.controller, facts, self.length))
         if key not in _kept_nmpc:
             controller = self._new()
             # Of these nothing but θ outlives a run; of a user's controller that is not known.
             if type(controller) not in (RtiNmpc, ConvergedNmpc):
                 return controller
+            nmpc = cast(RtiNmpc, controller)
+            # The last one alone: items of one controller come one after the other.
             _kept_nmpc.clear()
-            _kept_nmpc[key] = cast(RtiNmpc, controller), cast(RtiNmpc, controller).theta
-        nmpc, theta = _kept_nmpc[key]
-        nmpc.theta = np.array(self.theta) if self.theta else theta
+            _kept_nmpc[key] = (nmpc, nmpc.theta)
+        nmpc, own_theta = _kept_nmpc[key]
+        # An item before this one may have set another.
+        nmpc.theta = np.array(self.theta) if self.theta else own_theta
         return nmpc
 
     def _new(self) -> Controller:

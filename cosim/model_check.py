@@ -88,7 +88,11 @@ class ModelCheck:
         """The answer in a line."""
         if self.agrees:
             return f"FMU and model agree at {self.points} points"
-        wrong = [item.name for item in self.differences if not item.share <= self.tolerance]
+        wrong = []
+        for item in self.differences:
+            # Written so that no number differs, too.
+            if not item.share <= self.tolerance:
+                wrong.append(item.name)
         return f"FMU and model differ in {', '.join(wrong)}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -145,15 +149,22 @@ def check_model(
         task = given.replace({"plant": {"fmu": _name(fmu, archive)}})
     _require_sizes(task, loaded)
     task, remarks = _reading(task, archive, loaded)
+    # The probe says to which instant an output belongs.
     kinds = probe(task).kinds
     generator = np.random.default_rng(seed)
-    samples = _sample(task, points, generator, scenario is not None, remarks)
+    bounded = scenario is not None
+    samples = _sample(task, points, generator, bounded, remarks)
     remarks += _hidden_state_remarks(task, archive)
     remarks += _parameter_remarks(task, archive, loaded)
     remarks += _unit_remarks(task, archive, loaded)
     differences = _differences(task, archive, loaded, samples, kinds)
-    agrees = all(item.share <= tolerance for item in differences)
-    return ModelCheck(agrees, tolerance, len(samples.x), tuple(differences), tuple(remarks))
+    return ModelCheck(
+        agrees=all(item.share <= tolerance for item in differences),
+        tolerance=tolerance,
+        points=len(samples.x),
+        differences=tuple(differences),
+        remarks=tuple(remarks),
+    )
 
 
 def _name(fmu: str | Path, archive: UnpackedFmu) -> str:
@@ -189,18 +200,29 @@ def _drafted(
         names[kind] = own
     roles = guess_roles(archive, names["states"], names["actions"], stage_cost)
     document = first_document(fmu, archive, roles, sampling_time)
+    plant = document["plant"]
+    whole_mapping = plant["mapping"]
     document["disturbance"] = {"law": "none"}
-    grid = document["plant"]["mapping"]
-    document["plant"]["mapping"] = {}
+    plant["mapping"] = {}
     parameters = start_parameters(Scenario.from_dict(document), archive)
-    mapping = {key: grid[key] for key in ("seed", "sampling_time") if key in grid}
+    mapping = _without_law(whole_mapping)
+    # Those of some states alone are of no use: a point is all of them.
     state_names = names["states"]
     if all(name in parameters for name in state_names):
         starts = [parameters[name] for name in state_names]
         mapping["initial_state"] = starts
-        document["plant"]["initial_state"] = [start_value(archive, name) for name in starts]
-    document["plant"]["mapping"] = mapping
+        plant["initial_state"] = [start_value(archive, name) for name in starts]
+    plant["mapping"] = mapping
     return Scenario.from_dict(document)
+
+
+def _without_law(mapping: Mapping[str, Any]) -> dict[str, Any]:
+    """What a scenario maps, but for what sets the disturbances: they are as the FMU draws them."""
+    kept = {}
+    for key in ("initial_state", "seed", "sampling_time"):
+        if mapping.get(key):
+            kept[key] = mapping[key]
+    return kept
 
 
 def _require_sizes(task: Scenario, model: Model) -> None:
@@ -240,18 +262,13 @@ def _reading(task: Scenario, archive: UnpackedFmu, model: Model) -> tuple[Scenar
         else:
             read.append(name)
     document = task.to_dict()
-    plant = dict(document["plant"])
-    mapping = dict(plant["mapping"])
-    kept = {}
-    for key in ("initial_state", "seed", "sampling_time"):
-        if mapping.get(key):
-            kept[key] = mapping[key]
-    plant["mapping"] = kept
+    plant = document["plant"]
+    plant["mapping"] = _without_law(plant["mapping"])
     plant["disturbances"] = read
     # The optimum's conditions are not asked for here.
     plant.pop("model", None)
-    document["plant"] = plant
     document["disturbance"] = {"law": "none"}
+    # Exact states under constant parameters are compared.
     for key in ("sensor", "estimator", "signal"):
         document.pop(key, None)
     return Scenario.from_dict(document), remarks
@@ -288,8 +305,12 @@ def _sample(
         x_lower = np.maximum(task.state_lower, low)
         x_upper = np.minimum(task.state_upper, high)
         x_lower, x_upper = _box(task.plant.initial_state, x_lower, x_upper, bounded)
-        u_lower, u_upper = task.action_lower, task.action_upper
-        u_lower, u_upper = _box(task.reference_action, u_lower, u_upper, bounded)
+        u_lower, u_upper = _box(
+            task.reference_action,
+            task.action_lower,
+            task.action_upper,
+            bounded,
+        )
         if not settable:
             remarks.append(
                 "nothing sets the FMU's initial state: the points are those of a run with random "
@@ -297,6 +318,7 @@ def _sample(
             )
         running = False
         for k in range(points):
+            # Drawn in any case: the points do not hang on where the FMU fails.
             start = generator.uniform(x_lower, x_upper)
             u = generator.uniform(u_lower, u_upper)
             try:
@@ -306,6 +328,7 @@ def _sample(
                     x = plant.reset(k)
                 step = plant.step(u)
             except PlantError as error:
+                # A run that failed begins anew.
                 running = False
                 failures.append(str(error))
                 # A plant that fails everywhere is no matter of the points.
@@ -317,8 +340,11 @@ def _sample(
             running = True
     if failures:
         remarks.append(f"the FMU failed at {len(failures)} points, left out: {failures[0]}")
-    columns = [np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)]
-    return _Samples(*columns)
+    columns = []
+    for column in zip(*rows, strict=True):
+        columns.append(np.array(column, dtype=np.float64))
+    x, u, read, cost, next_x = columns
+    return _Samples(x, u, read, cost, next_x)
 
 
 def _box(
@@ -341,13 +367,16 @@ def _box(
 
 def _hidden_state_remarks(task: Scenario, archive: UnpackedFmu) -> list[str]:
     """Continuous states of the FMU that no state of the model stands for."""
-    named = {name.partition("[")[0] for name in task.plant.states}
+    named = set()
+    for name in task.plant.states:
+        # The description has an array as one state.
+        variable, _, _ = name.partition("[")
+        named.add(variable)
     hidden = [name for name in continuous_states(archive.path) if name not in named]
     if not hidden:
         return []
-    return [
-        f"the FMU has the states {', '.join(hidden)}, too: from the same point it may go elsewhere"
-    ]
+    words = ", ".join(hidden)
+    return [f"the FMU has the states {words}, too: from the same point it may go elsewhere"]
 
 
 def _parameter_remarks(task: Scenario, archive: UnpackedFmu, model: Model) -> list[str]:
@@ -375,9 +404,11 @@ def _unit_remarks(task: Scenario, archive: UnpackedFmu, model: Model) -> list[st
     quantities = (*model.states, *model.actions)
     remarks = []
     for name, quantity in zip(names, quantities, strict=True):
-        unit = archive.unit(name)
-        if unit and quantity.unit and unit != quantity.unit:
-            remarks.append(f"{name} is in {unit} in the FMU and in {quantity.unit} in the model")
+        theirs = archive.unit(name)
+        ours = quantity.unit
+        # A unit that is not stated contradicts none.
+        if theirs and ours and theirs != ours:
+            remarks.append(f"{name} is in {theirs} in the FMU and in {ours} in the model")
     return remarks
 
 
@@ -391,41 +422,54 @@ def _differences(
     """The largest difference in each state, in the cost and in each output."""
     plant = task.plant
     count = len(samples.x)
+    x = samples.x.T
+    u = samples.u.T
     # What the FMU shows of disturbances and outputs, by name.
     read = dict(zip(plant.disturbances, samples.read.T, strict=True))
     d = np.empty((len(model.disturbances), count))
-    point: dict[str, Array] = dict(zip(plant.states, samples.x.T, strict=True))
-    point |= dict(zip(plant.actions, samples.u.T, strict=True))
+    # The variables' values at the points, for the report.
+    point: dict[str, Array] = dict(zip(plant.states, x, strict=True))
+    point |= dict(zip(plant.actions, u, strict=True))
     for i, quantity in enumerate(model.disturbances):
         # A disturbance that the FMU does not show has its nominal value.
         d[i] = read.get(quantity.name, quantity.nominal)
         point[quantity.name] = d[i]
     p = np.tile(model.nominal_parameters[:, None], (1, count))
-    arguments = (samples.x.T, samples.u.T, d, p)
-    next_x = _next_states(model, task.sampling_time, arguments)
+    next_x = _next_states(model, task.sampling_time, (x, u, d, p))
     result = []
     for i, name in enumerate(plant.states):
         of_fmu = samples.next_x[:, i]
         # A slow state is the same in both for lack of time: its movement is what counts.
-        movement = float(np.abs(of_fmu - samples.x[:, i]).max())
-        title = f"{name} a sample later"
-        unit = archive.unit(name)
-        result.append(_compare_at(model, title, unit, of_fmu, next_x[i], movement, point))
+        movement = np.abs(of_fmu - x[i])
+        difference = _compare_at(
+            model,
+            f"{name} a sample later",
+            archive.unit(name),
+            of_fmu,
+            next_x[i],
+            float(movement.max()),
+            point,
+        )
+        result.append(difference)
 
     def compare_output(name: str, function: ca.Function, of_fmu: Array) -> ModelDifference:
         """Compare at the time to which the FMU's output belongs."""
         at_end = kinds.get(name) is OutputKind.END
-        states = next_x if at_end else samples.x.T
-        of_model = _evaluate(function, (states, *arguments[1:]))[0]
+        states = next_x if at_end else x
+        of_model = _evaluate(function, (states, u, d, p))[0]
         spread = float(np.ptp(of_fmu))
-        return _compare_at(model, name, archive.unit(name), of_fmu, of_model, spread, point)
+        unit = archive.unit(name)
+        return _compare_at(model, name, unit, of_fmu, of_model, spread, point)
 
-    result.append(compare_output(plant.stage_cost, economic_cost(model), samples.cost))
+    cost = compare_output(plant.stage_cost, economic_cost(model), samples.cost)
+    result.append(cost)
     symbols = model.symbols()
     for name, output in model.outputs.items():
+        # The others have their remark.
         if name in read:
             function = ca.Function("y", list(symbols), [output(*symbols)])
-            result.append(compare_output(name, function, read[name]))
+            difference = compare_output(name, function, read[name])
+            result.append(difference)
     return result
 
 
@@ -455,19 +499,26 @@ def _compare_at(
     finite = np.isfinite(of_model)
     if not finite.all():
         first = int(np.argmin(finite))
-        place = ", ".join(f"{key} = {values[first]:.5g}" for key, values in point.items())
+        coordinates = [f"{key} = {values[first]:.5g}" for key, values in point.items()]
+        place = ", ".join(coordinates)
         raise ModelError(f"model '{model.name}' gives no finite number for {name} at {place}")
     gaps = np.abs(of_fmu - of_model)
     worst = int(np.argmax(gaps))
     gap = float(gaps[worst])
     # What does not vary is compared with its own size.
     reference = scale or float(np.abs(of_fmu).max())
+    # Of what is 0 throughout any difference is too large.
     share = inf if gap else 0.0
     if reference:
         share = gap / reference
-    where = {key: float(values[worst]) for key, values in point.items()}
     return ModelDifference(
-        name, unit, gap, share, float(of_fmu[worst]), float(of_model[worst]), where
+        name=name,
+        unit=unit,
+        difference=gap,
+        share=share,
+        fmu=float(of_fmu[worst]),
+        model=float(of_model[worst]),
+        where={key: float(values[worst]) for key, values in point.items()},
     )
 
 
@@ -477,8 +528,10 @@ def _evaluate(function: ca.Function, arguments: tuple[Array, ...]) -> Array:
     columns = []
     for values in arguments:
         # CasADi takes an array without rows for one without columns, too.
-        columns.append(ca.DM(values) if values.size else ca.DM.zeros(0, count))
-    result: Array = function.map(count)(*columns).full()
+        matrix = ca.DM(values) if values.size else ca.DM.zeros(0, count)
+        columns.append(matrix)
+    at_all_points = function.map(count)
+    result: Array = at_all_points(*columns).full()
     return result
 
 
@@ -500,7 +553,8 @@ def _next_states(model: Model, sampling_time: float, arguments: tuple[Array, ...
             movement = np.abs(state - x).max(axis=1)
             size = np.abs(state).max(axis=1) + movement
             # A state that is 0 throughout has no size.
-            if (change <= ACCURATE * size + 1e-300).all():
+            allowed = ACCURATE * size + 1e-300
+            if (change <= allowed).all():
                 return state
         before = state
         substeps *= 2

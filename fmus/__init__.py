@@ -19,8 +19,9 @@ def path(name: str = "evaporator") -> Path:
 
     Raises FmuError for another name.
     """
-    if name not in (*NAMES, *PLANTS):
-        raise FmuError(f"there is no FMU {name!r}; shipped are {', '.join((*NAMES, *PLANTS))}")
+    shipped = (*NAMES, *PLANTS)
+    if name not in shipped:
+        raise FmuError(f"there is no FMU {name!r}; shipped are {', '.join(shipped)}")
     return Path(__file__).parent / f"{name}.fmu"
 
 
@@ -42,9 +43,12 @@ class Platform:
 
     def folder(self, fmi_version: str) -> str:
         """The name of its folder under ``binaries/`` in FMI `fmi_version`."""
-        return self.fmi2_folder if fmi_version.startswith("2") else self.tuple
+        if fmi_version.startswith("2"):
+            return self.fmi2_folder
+        return self.tuple
 
 
+# The oldest systems that a library shall run on: a glibc of 2012, macOS of 2020.
 PLATFORMS = (
     Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
     Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
@@ -65,10 +69,28 @@ def present() -> Platform:
     return known[platform_tuple]
 
 
-_ELF = {0x3E: "x86_64", 0xB7: "aarch64", 0x03: "x86", 0x28: "aarch32"}
-_PE = {0x8664: "x86_64", 0xAA64: "aarch64", 0x14C: "x86", 0x1C4: "aarch32"}
-_MACH_O = {0x01000007: "x86_64", 0x0100000C: "aarch64", 7: "x86"}
-UNIVERSAL, _MACH_O_64, _MACH_O_32 = 0xCAFEBABE, 0xFEEDFACF, 0xFEEDFACE
+# Each format's number of an architecture.
+_ELF = {
+    0x3E: "x86_64",
+    0xB7: "aarch64",
+    0x03: "x86",
+    0x28: "aarch32",
+}
+_PE = {
+    0x8664: "x86_64",
+    0xAA64: "aarch64",
+    0x14C: "x86",
+    0x1C4: "aarch32",
+}
+_MACH_O = {
+    0x01000007: "x86_64",
+    0x0100000C: "aarch64",
+    7: "x86",
+}
+UNIVERSAL = 0xCAFEBABE
+_MACH_O_64 = 0xFEEDFACF
+_MACH_O_32 = 0xFEEDFACE
+"""Magic numbers of Mach-O files, a universal binary's in the order of its bytes."""
 
 
 def platforms_of(library: bytes) -> tuple[str, ...]:
@@ -114,6 +136,8 @@ def _mach_o_platforms(library: bytes) -> tuple[str, ...]:
         return ()
     platforms = []
     for position in range(count):
-        (cpu,) = struct.unpack_from(">I", library, 8 + 20 * position)
+        # Behind the header of 8 bytes, an entry of 20 for each slice.
+        start = 8 + 20 * position
+        (cpu,) = struct.unpack_from(">I", library, start)
         platforms.append(f"{_MACH_O.get(cpu, '?')}-darwin")
     return tuple(platforms)

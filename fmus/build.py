@@ -11,7 +11,7 @@ import subprocess
 import sys
 import uuid
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,6 +83,7 @@ def write_archive(files: Mapping[str, bytes], target: Path) -> Path:
     """
     with replacing(target) as partial, zipfile.ZipFile(partial, "x") as container:
         for name in sorted(files):
+            # Of one date, and not compressed: another zlib would write other bytes.
             entry = zipfile.ZipInfo(name, _DATE)
             # As on Unix, a file that all may read, whatever the platform.
             entry.create_system = 3
@@ -298,7 +299,11 @@ def _libraries(
         for compiler in compilers:
             future = pool.submit(compiler.library, sources, identifier, warnings)
             futures[compiler.platform] = future
-        return {platform: future.result() for platform, future in futures.items()}
+        # A compiler is a process: the threads only wait for them.
+        libraries = {}
+        for platform, future in futures.items():
+            libraries[platform] = future.result()
+        return libraries
 
 
 def build_folder(
@@ -322,8 +327,16 @@ def build_folder(
     """
     folder = Path(folder)
     text = (folder / "modelDescription.xml").read_bytes()
-    sources = {path.name: path.read_bytes() for path in folder.glob("*.[ch]")}
+    sources = _contents(folder.glob("*.[ch]"))
     return build_fmu(target, sources, text, every_platform=every_platform)
+
+
+def _contents(paths: Iterable[Path]) -> dict[str, bytes]:
+    """Content of files by name."""
+    contents = {}
+    for path in paths:
+        contents[path.name] = path.read_bytes()
+    return contents
 
 
 def _model(description: bytes) -> tuple[str, str]:
@@ -359,7 +372,8 @@ HEADER = "variables.h"
 
 def files_of(folder: str) -> dict[str, bytes]:
     """File name → bytes of the C headers in a folder of this package."""
-    return {path.name: path.read_bytes() for path in (PACKAGE / folder).glob("*.h")}
+    headers = (PACKAGE / folder).glob("*.h")
+    return _contents(headers)
 
 
 def sources_of(model: FmuModel, version: FmiVersion) -> dict[str, bytes]:
@@ -485,6 +499,7 @@ def token_of(
     digest = hashlib.sha256(description.encode())
     counted = sources.keys() - {HEADER, "buildDescription.xml"}
     for name in sorted(counted):
+        # The null byte ends a name as nothing in it can.
         digest.update(name.encode() + b"\0" + sources[name])
     identifier = uuid.UUID(bytes=digest.digest()[:16], version=5)
     return f"{{{identifier}}}"

@@ -62,13 +62,19 @@ def information(fmu: Path, description: ModelDescription | None = None) -> dict[
     model = description or description_of(fmu)
     platforms: dict[str, tuple[str, ...]] = {}
     with zipfile.ZipFile(fmu) as container:
-        # Some tools on Windows write backslashes.
-        entries = {entry.filename.replace("\\", "/"): entry for entry in container.infolist()}
-        root = etree.fromstring(container.read(entries["modelDescription.xml"]))
+        entries = {}
+        for entry in container.infolist():
+            # Some tools on Windows write backslashes.
+            name = entry.filename.replace("\\", "/")
+            entries[name] = entry
+        text = container.read(entries["modelDescription.xml"])
+        root = etree.fromstring(text)
         for name, entry in sorted(entries.items()):
-            if re.fullmatch(r"binaries/[^/]+/[^/]+\.(so|dll|dylib)", name):
+            library = re.fullmatch(r"binaries/([^/]+)/[^/]+\.(so|dll|dylib)", name)
+            if library is not None:
+                # What it is made for its own bytes say: a folder may have any name.
                 made_for = platforms_of(container.read(entry))
-                platforms[name.split("/")[1]] = made_for or ("not a library",)
+                platforms[library[1]] = made_for or ("not a library",)
     for name in entries:
         if name.startswith("sources/") and name.endswith(".c"):
             platforms["c-code"] = ()
@@ -77,12 +83,14 @@ def information(fmu: Path, description: ModelDescription | None = None) -> dict[
         element = root.find(tag)
         if element is not None:
             attributes = dict(element.attrib)
+            # It is a name, and no ability.
             attributes.pop("modelIdentifier", None)
             flags[words] = attributes
     experiment = model.defaultExperiment
     variables = []
     for variable in model.modelVariables:
-        variables.append({name: getattr(variable, name) for name in _VARIABLE})
+        facts = {name: getattr(variable, name) for name in _VARIABLE}
+        variables.append(facts)
     return {
         "path": str(fmu),
         "sha256": hashlib.sha256(fmu.read_bytes()).hexdigest(),
@@ -121,7 +129,12 @@ def validate(fmu: Path) -> str:
 
 def problems_of(fmu: Path) -> list[str]:
     """What an FMU, a file or an unpacked folder, has against FMI's rules of its description."""
-    return [" ".join(str(problem).split()) for problem in validate_fmu(str(fmu))]
+    lines = []
+    for problem in validate_fmu(str(fmu)):
+        # One line each: those of lxml have several.
+        words = str(problem).split()
+        lines.append(" ".join(words))
+    return lines
 
 
 def declared_variables(fmu: Path) -> str:
@@ -132,5 +145,12 @@ def declared_variables(fmu: Path) -> str:
     names = [variable.name for variable in description.modelVariables]
     stated = getattr(description.defaultExperiment, "stepSize", None)
     step = _optional_number(stated) or 1.0
-    fmpy.simulate_fmu(str(fmu), output=names, start_time=0.0, stop_time=step, output_interval=step)
+    # One step: fmpy records every output before it and after.
+    fmpy.simulate_fmu(
+        str(fmu),
+        output=names,
+        start_time=0.0,
+        stop_time=step,
+        output_interval=step,
+    )
     return f"{len(names)} read"

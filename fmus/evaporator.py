@@ -30,6 +30,10 @@ UNITS = (
 
 VARIABLES = tuple(read_variables(RESOURCES / "evaporator.csv"))
 
+# The header stands in the source tree for whoever reads it; a build generates its own.
+_EVAPORATOR_SOURCES = files_of("sources")
+_EVAPORATOR_SOURCES.pop(HEADER, None)
+
 EVAPORATOR = FmuModel(
     name="Evaporator",
     identifier="evaporator",
@@ -40,7 +44,7 @@ EVAPORATOR = FmuModel(
     derivatives=True,
     terminal=("X2", "P2", "P100", "F200"),
     units=UNITS,
-    sources={name: data for name, data in files_of("sources").items() if name != HEADER},
+    sources=_EVAPORATOR_SOURCES,
     origin="fmus/evaporator.py by `cosim fmu build --in-place`",
 )
 
@@ -57,12 +61,14 @@ def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
             "target": compiler.platform.target,
             "linker_flags": list(compiler.linker_flags),
         }
+    sources = sources_of(EVAPORATOR, version)
     record = {
         "compiler_flags": [*COMPILER_FLAGS, *WARNINGS],
         "platforms": platforms,
-        "model_token": token_of(EVAPORATOR, version, sources_of(EVAPORATOR, version)),
+        "model_token": token_of(EVAPORATOR, version, sources),
     }
-    return (json.dumps(record, indent=2) + "\n").encode()
+    text = json.dumps(record, indent=2)
+    return f"{text}\n".encode()
 
 
 def build_evaporator(folder: Path, every_platform: bool = False) -> list[Path]:
@@ -78,6 +84,7 @@ def build_evaporator(folder: Path, every_platform: bool = False) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     diagram = (RESOURCES / "diagram.svg").read_text(encoding="utf-8")
+    # Each version of FMI has a place of its own for a picture.
     icons: dict[FmiVersion, str] = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
     built = []
     for name, (version, icon) in zip(NAMES, icons.items(), strict=True):
@@ -125,8 +132,10 @@ def differences(built: Path, shipped: Path) -> list[str]:
         raise BuildError(f"{shipped} is missing; reinstall the package")
     if built.read_bytes() == shipped.read_bytes():
         return []
-    checksums = _checksums(built).items() ^ _checksums(shipped).items()
-    return sorted({name for name, _ in checksums}) or ["(order or metadata)"]
+    # What is in one of them alone, and what has another content there.
+    unequal = _checksums(built).items() ^ _checksums(shipped).items()
+    names = {name for name, _ in unequal}
+    return sorted(names) or ["(order or metadata)"]
 
 
 def _checksums(path: Path) -> dict[str, int]:
@@ -143,12 +152,17 @@ def compare_with_shipped() -> dict[str, list[str]]:
             *build_evaporator(folder, every_platform=True),
             *plant.build_shipped_plants(folder, every_platform=True),
         ]
-        return {path.name: differences(path, PACKAGE / path.name) for path in built}
+        unequal = {}
+        for path in built:
+            shipped = PACKAGE / path.name
+            unequal[path.name] = differences(path, shipped)
+        return unequal
 
 
 def build_in_place() -> list[Path]:
     """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
-    (SOURCES / HEADER).write_bytes(sources_of(EVAPORATOR, 2)[HEADER])
+    header = sources_of(EVAPORATOR, 2)[HEADER]
+    (SOURCES / HEADER).write_bytes(header)
     return [
         *build_evaporator(PACKAGE, every_platform=True),
         *plant.build_shipped_plants(PACKAGE, every_platform=True),

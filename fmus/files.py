@@ -17,8 +17,11 @@ def protect(paths: Iterable[str | Path]) -> None:
     """Protect these files, the inputs of the command and no others, from all writers."""
     _inputs.clear()
     for path in paths:
+        # A word of the command need not be a path at all.
         with suppress(OSError, ValueError):
-            if stat.S_ISREG((status := Path(path).stat()).st_mode):
+            status = Path(path).stat()
+            # By device and number: a file has several paths.
+            if stat.S_ISREG(status.st_mode):
                 _inputs.add((status.st_dev, status.st_ino))
 
 
@@ -47,13 +50,16 @@ def replacing(path: str | Path) -> Iterator[Path]:
     is full.
     """
     path = check_target(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
+    # Beside it: a rename is at once in one file system alone. Writers tell a format by the suffix.
+    word = secrets.token_hex(4)
+    temporary = path.with_name(f".{path.name}.{word}{path.suffix}")
     try:
         yield temporary
         publish(temporary, path)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+        # The name that the user knows.
         if isinstance(error, OSError) and error.errno:
             error.filename = str(path)
         raise
@@ -70,6 +76,7 @@ def publish(temporary: Path, path: Path) -> None:
         OSError: if that is not possible; as `check_target`, too.
     """
     check_target(path)
+    # Else a power cut may leave the new name with nothing behind it.
     with temporary.open("rb+") as stream:
         os.fsync(stream.fileno())
     temporary.replace(path)
@@ -85,6 +92,7 @@ def write_atomically(path: str | Path, data: bytes | str) -> Path:
     Returns:
         The path.
     """
+    content = data.encode() if isinstance(data, str) else data
     with replacing(path) as temporary:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        temporary.write_bytes(content)
     return Path(path)

@@ -7,6 +7,7 @@ import hashlib
 import html
 import re
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -15,7 +16,7 @@ from functools import cache, cached_property, partial
 from importlib.metadata import version as version_of
 from os.path import commonprefix
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 FmiVersion = Literal[2, 3]
 
@@ -81,6 +82,7 @@ def read_variables(file: Path) -> list[Variable]:
         for row in csv.DictReader(lines):
             numbers = {}
             for key in ("start", "min", "max", "nominal"):
+                # An empty cell is a number that the variable does not have.
                 numbers[key] = float(row[key]) if row[key] else None
             variable = Variable(
                 row["name"],
@@ -116,8 +118,10 @@ class Unit:
         return attributes
 
 
-_TABLE = (Path(__file__).parent / "resources" / "units.csv").read_text(encoding="utf-8")
-_SIMPLE = {row["name"]: row for row in csv.DictReader(_TABLE.splitlines())}
+_UNITS_FILE = Path(__file__).parent / "resources" / "units.csv"
+_UNITS_TEXT = _UNITS_FILE.read_text(encoding="utf-8")
+_SIMPLE = {row["name"]: row for row in csv.DictReader(_UNITS_TEXT.splitlines())}
+# Several factors below the line stand in brackets: `cm3/(V.s)`.
 _QUOTIENT = re.compile(r"[^/()]*(/(\([^/()]*\)|[^/().]*))*")
 _POWER = re.compile(r"(1|[A-Za-z%]+)(-?\d+)?")
 _EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
@@ -146,17 +150,25 @@ def unit(name: str) -> Unit:
             symbols = part.strip("()").split(".")
         for symbol in symbols:
             match = _POWER.fullmatch(symbol)
-            if match is None or match[1] not in _SIMPLE:
+            if match is None:
                 return unknown
-            simple = _SIMPLE[match[1]]
-            power = sign * int(match[2] or 1)
+            simple_name, digits = match.groups()
+            if simple_name not in _SIMPLE:
+                return unknown
+            simple = _SIMPLE[simple_name]
+            power = sign * int(digits or 1)
             factor *= Fraction(simple["factor"]) ** power
             for base, exponent in _EXPONENT.findall(simple["exponents"]):
                 exponents[base] += power * int(exponent)
     offset = Fraction(0)
+    # A rate in degC/min is that in K/min.
     if name in _SIMPLE:
         offset = Fraction(_SIMPLE[name]["offset"])
-    occurring = {base: exponent for base, exponent in exponents.items() if exponent}
+    occurring = {}
+    for base, exponent in exponents.items():
+        # FMI's default is 0.
+        if exponent != 0:
+            occurring[base] = exponent
     return Unit(name, float(factor), float(offset), occurring)
 
 
@@ -201,14 +213,15 @@ class FmuModel:
     @cached_property
     def arrays(self) -> dict[str, list[Variable]]:
         """The elements of FMI 3.0's arrays, in table order, by the arrays' names."""
-        arrays: dict[str, list[Variable]] = {}
+        arrays: dict[str, list[Variable]] = defaultdict(list)
         if not self.sampled:
             return arrays
         for variable in self.variables:
             name, bracket, _ = variable.name.partition("[")
             if bracket and variable.type is Type.REAL:
-                arrays.setdefault(name, []).append(variable)
-        return arrays
+                arrays[name].append(variable)
+        # A look at a name that is no array must not make one.
+        return dict(arrays)
 
     @cached_property
     def by_name(self) -> dict[str, Variable]:
@@ -236,6 +249,7 @@ class FmuModel:
         """
         if version == 2:
             return [v for v in self.variables if v.kind is not Kind.INDEPENDENT]
+        # By the table's variable what is shown in its place, in the order of the table.
         shown = {}
         for variable in self.variables:
             if variable.type not in (Type.SEED_HIGH, Type.LAW_NUMBER):
@@ -245,9 +259,9 @@ class FmuModel:
             descriptions = [element.description for element in elements]
             common = commonprefix(descriptions).rstrip(", ")  # noqa: RUF071
             indices = [element.name.removeprefix(name) for element in elements]
-            description = f"{common}: {' '.join(indices)}"
+            order = " ".join(indices)
             first, *others = elements
-            shown[first] = replace(first, name=name, description=description)
+            shown[first] = replace(first, name=name, description=f"{common}: {order}")
             for element in others:
                 del shown[element]
         return list(shown.values())
@@ -297,8 +311,11 @@ def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
         # A state depends on its start parameter.
         if model.by_name[known].kind is Kind.STATE:
             names |= closure(known, model)
-    settable = [variable.name for variable in model.variables if variable.settable]
-    return tuple(name for name in settable if name in names)
+    dependencies = []
+    for variable in model.variables:
+        if variable.settable and variable.name in names:
+            dependencies.append(variable.name)
+    return tuple(dependencies)
 
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -336,6 +353,7 @@ def _template(name: str) -> Any:
 
 def _xml(text: str) -> str:
     escaped = html.escape(text, quote=False)
+    # In an attribute a reader takes a plain end of line for a blank.
     return escaped.replace('"', "&quot;").replace("\n", "&#10;")
 
 
@@ -380,19 +398,25 @@ def model_description(
         unit_names = list(model.units)
     else:
         # Once, in the order of the table.
-        named = [variable.unit for variable in model.variables if variable.unit]
-        unit_names = list(dict.fromkeys(named))
+        unit_names = []
+        for variable in model.variables:
+            if variable.unit and variable.unit not in unit_names:
+                unit_names.append(variable.unit)
     variables = []
     for variable in model.exported(version):
+        common = _common_attributes(variable, model)
         element, attributes = _type(version, variable, model)
-        variables.append((_common_attributes(variable, model), element, attributes))
+        variables.append((common, element, attributes))
+    tool = "rti-cosim"
+    # The shipped files stay the same from one version to the next.
+    if model.sampled:
+        tool = f"rti-cosim {version_of('rti-cosim')}"
     return render(
         "modelDescription.xml",
         version=version,
         token=token,
         model=model,
-        # The shipped files stay the same from one version to the next.
-        tool=f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
+        tool=tool,
         types={variable.type.name for variable in model.variables},
         units=[unit(name) for name in unit_names],
         variables=variables,
@@ -421,8 +445,10 @@ def build_description(version: FmiVersion, model: FmuModel) -> str:
 def _common_attributes(variable: Variable, model: FmuModel) -> Attributes:
     """The attributes that every variable has in FMI 2.0 and 3.0."""
     causality, variability, initial = _CAUSALITY[variable.kind]
+    # It changes at the samples alone.
     if variable.kind is Kind.OUTPUT and model.sampled:
         variability = "discrete"
+    # FMI allows continuous variables of real types alone.
     if variable.kind is Kind.INPUT and variable.type is not Type.REAL:
         variability = "discrete"
     return {
@@ -470,13 +496,17 @@ def _real_attributes(
         if value is None or (key == "nominal" and value == 0.0):
             continue
         attributes[key] = float(value)
+    # An array has one attribute with the starts of all its elements.
     if variable.start is not None and variable.name in model.arrays:
-        elements = model.arrays[variable.name]
-        starts = [str(float(element.start or 0.0)) for element in elements]
+        starts = []
+        for element in model.arrays[variable.name]:
+            start = float(element.start or 0.0)
+            starts.append(str(start))
         attributes["start"] = " ".join(starts)
     if variable.kind is Kind.DERIVATIVE:
         state = variable.name.removeprefix("der(").removesuffix(")")
-        attributes["derivative"] = _numbering(version, model)(state)
+        number_of = _numbering(version, model)
+        attributes["derivative"] = number_of(state)
     calculated = variable.kind in (Kind.STATE, Kind.OUTPUT)
     if version == 3 and calculated and not model.sampled:
         attributes["intermediateUpdate"] = "true"
@@ -492,13 +522,42 @@ def _numbering(version: FmiVersion, model: FmuModel) -> Callable[[str], int]:
     return lambda name: names.index(name) + 1
 
 
+class _Unknowns(NamedTuple):
+    """A group of FMI's ModelStructure.
+
+    Attributes:
+        element: FMI 3.0's name of one unknown.
+        group: FMI 2.0's name of the element around them.
+        kinds: of the variables in it.
+        dependencies_of: names that a variable of a model depends on.
+    """
+
+    element: str
+    group: str
+    kinds: tuple[Kind, ...]
+    dependencies_of: Callable[[str, FmuModel], tuple[str, ...]]
+
+
 _UNKNOWNS = (
-    ("Output", "Outputs", (Kind.STATE, Kind.OUTPUT), continuous_dependencies),
-    ("ContinuousStateDerivative", "Derivatives", (Kind.DERIVATIVE,), continuous_dependencies),
-    ("InitialUnknown", "InitialUnknowns", (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT),
-     initial_dependencies),
-)  # fmt: skip
-"""FMI 3.0's element of an unknown, FMI 2.0's around them, their kinds, their dependencies."""
+    _Unknowns(
+        "Output",
+        "Outputs",
+        (Kind.STATE, Kind.OUTPUT),
+        continuous_dependencies,
+    ),
+    _Unknowns(
+        "ContinuousStateDerivative",
+        "Derivatives",
+        (Kind.DERIVATIVE,),
+        continuous_dependencies,
+    ),
+    _Unknowns(
+        "InitialUnknown",
+        "InitialUnknowns",
+        (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT),
+        initial_dependencies,
+    ),
+)
 
 
 def _structure(
@@ -506,29 +565,34 @@ def _structure(
     model: FmuModel,
 ) -> list[tuple[str, str, list[Attributes]]]:
     """The unknowns of ModelStructure by group, with their dependencies."""
-    number = _numbering(version, model)
+    number_of = _numbering(version, model)
     reference = "index" if version == 2 else "valueReference"
     # By the names of the table: FMI 3.0 shows an array in place of its first element.
-    shown = {model.by_name[variable.name].name for variable in model.exported(version)}
+    shown = set()
+    for variable in model.exported(version):
+        first_element = model.by_name[variable.name]
+        shown.add(first_element.name)
     structure = []
-    for element, group, kinds, dependencies_of in _UNKNOWNS:
+    for group in _UNKNOWNS:
         unknowns: list[Attributes] = []
-        for name in model.names(*kinds):
+        for name in model.names(*group.kinds):
             if name not in shown:
                 continue
-            dependencies = [other for other in dependencies_of(name, model) if other in shown]
-            numbers = [str(number(other)) for other in dependencies]
+            numbers = []
+            for other in group.dependencies_of(name, model):
+                if other in shown:
+                    numbers.append(str(number_of(other)))
             # The states depend on themselves or on their start with constant factor 1.
             is_state = model.by_name[name].kind is Kind.STATE
             kind = "constant" if is_state else "dependent"
             unknown = {
-                reference: number(name),
+                reference: number_of(name),
                 "dependencies": " ".join(numbers),
                 "dependenciesKind": " ".join([kind] * len(numbers)),
             }
             unknowns.append(unknown)
         if unknowns:
-            structure.append((element, group, unknowns))
+            structure.append((group.element, group.group, unknowns))
     return structure
 
 
@@ -544,28 +608,36 @@ def c_header(token: str, model: FmuModel) -> str:
         model: the model.
     """
     names = "\n".join(variable.name for variable in model.variables)
+    digest = hashlib.sha256(names.encode())
+    most = sys.float_info.max if model.sampled else 0.0
     return render(
         "variables.h",
         token=token,
         model=model,
         origin=model.origin or f"the table of {model.name}",
         # A serialised state of another table is refused.
-        layout=hashlib.sha256(names.encode()).hexdigest()[:16],
+        layout=digest.hexdigest()[:16],
         types=list(Type.__members__),
         kinds=list(Kind.__members__),
-        numbers=partial(_start_and_range, sys.float_info.max if model.sampled else 0.0),
+        numbers=partial(_start_and_range, most),
     )
 
 
 def _start_and_range(most: float, variable: Variable) -> tuple[float, ...]:
     """Start, range and nominal value as the C has them; without a range it is −`most` to `most`."""
-    low = -most if variable.min is None else variable.min
-    high = most if variable.max is None else variable.max
+    low = variable.min
+    high = variable.max
+    nominal = variable.nominal
+    if low is None:
+        low = -most
+    if high is None:
+        high = most
+    if nominal is None:
+        nominal = 1.0
     # In C a word of the seed has 32 bits and no sign.
     if variable.type in (Type.SEED, Type.SEED_HIGH):
         low = 0.0
         high = 2.0**32 - 1
-    nominal = 1.0 if variable.nominal is None else variable.nominal
     numbers = (variable.start, low, high, nominal)
     # Nothing and −0.0 are written as 0.0.
     return tuple(float(number or 0.0) for number in numbers)

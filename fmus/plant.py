@@ -58,15 +58,18 @@ class Signal:
             uses: names of the variables that its equation needs.
         """
         calculated = kind in (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT)
+        start = None if calculated else self.start
+        # FMI forbids a nominal value of zero.
+        nominal = abs(self.start) or 1.0
         return Variable(
             self.name,
             kind,
             Type.REAL,
             self.unit,
-            start=None if calculated else self.start,
+            start=start,
             min=self.min,
             max=self.max,
-            nominal=abs(self.start) or 1.0,
+            nominal=nominal,
             description=self.description,
             uses=uses,
         )
@@ -109,21 +112,23 @@ def plant_model(
     """
     # What the equations may use: who wrote them is not asked which of these they do.
     every_state = (*states, *hidden)
-    known = tuple(s.name for s in (*every_state, *inputs, *disturbances, *parameters))
+    given = (*every_state, *inputs, *disturbances, *parameters)
+    known = tuple(signal.name for signal in given)
     switches = _switches(sampling_time)
-    draws = tuple(v.name for v in switches if v.name != "saturate")
+    # What the draws hang on; the other switch is about the inputs.
+    draws = tuple(switch.name for switch in switches if switch.name != "saturate")
     table = [Variable("time", Kind.INDEPENDENT, unit="s", description="time")]
     for state in every_state:
         table.append(state.variable(Kind.STATE, uses=(f"{state.name}_start",)))
     for state in every_state:
-        description_of_rate = f"time derivative of {state.name}"
         rate = Signal(
             f"der({state.name})",
             f"{state.unit}/s",
+            # For the nominal value alone: what is calculated has no start.
             start=state.start,
             min=-1e6,
             max=1e6,
-            description=description_of_rate,
+            description=f"time derivative of {state.name}",
         )
         table.append(rate.variable(Kind.DERIVATIVE, uses=known))
     for signal in inputs:
@@ -172,8 +177,11 @@ def _law_of(disturbance: Signal) -> tuple[Variable, Variable]:
     """Mean and range of a disturbance, which are its parameters."""
     name = disturbance.name
     mean = replace(
-        disturbance, name=f"{name}_nominal", description=f"mean {disturbance.description}"
+        disturbance,
+        name=f"{name}_nominal",
+        description=f"mean {disturbance.description}",
     )
+    # A wider one would leave the disturbance's range whatever the mean.
     widest = disturbance.max - disturbance.min
     spread = Signal(
         f"{name}_range",
@@ -230,13 +238,17 @@ def build_plant(
     """
     disturbances = []
     for name in model.by_name:
+        # Each has a parameter of this name (`_law_of`).
         if name.endswith("_nominal"):
             disturbances.append(name.removesuffix("_nominal"))
     states = [model.by_name[name].identifier for name in model.names(Kind.STATE)]
     header = render("states.h", model=model, states=states, drawn=disturbances)
-    sources = {name: (SOURCES / name).read_bytes() for name in _SHARED}
+    content = equations.encode() if isinstance(equations, str) else equations
+    sources = {}
+    for name in _SHARED:
+        sources[name] = (SOURCES / name).read_bytes()
     sources |= files_of("plant_sources")
-    sources["equations.h"] = equations.encode() if isinstance(equations, str) else equations
+    sources["equations.h"] = content
     sources["states.h"] = header.encode()
     complete = replace(model, sources=sources)
     return build_model(complete, target, version, every_platform=every_platform)
@@ -255,6 +267,7 @@ _ROLES = ("states", "hidden", "inputs", "disturbances", "outputs", "parameters")
 
 def model(name: str) -> FmuModel:
     """The table of a plant of `SHIPPED_PLANTS`."""
+    # Each role, also one that the table has no signal of.
     signals: dict[str, list[Signal]] = {role: [] for role in _ROLES}
     with (RESOURCES / f"{name}.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -289,6 +302,12 @@ def build_shipped_plants(folder: Path, every_platform: bool = False) -> list[Pat
     """
     built = []
     for name in SHIPPED_PLANTS:
-        target = folder / f"{name}.fmu"
-        built.append(build_plant(model(name), equations(name), target, 2, every_platform))
+        fmu = build_plant(
+            model(name),
+            equations(name),
+            folder / f"{name}.fmu",
+            version=2,
+            every_platform=every_platform,
+        )
+        built.append(fmu)
     return built

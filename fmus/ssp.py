@@ -47,7 +47,11 @@ def write_ssp(
     Raises:
         BuildError: if an FMU has no co-simulation.
     """
-    ends = {"controller": (controller, states, actions), "plant": (plant, actions, states)}
+    # What one gives the other takes.
+    ends = {
+        "controller": (controller, states, actions),
+        "plant": (plant, actions, states),
+    }
     components = []
     versions = set()
     units: dict[str, dict[str, float]] = {}
@@ -61,7 +65,10 @@ def write_ssp(
         members[f"resources/{name}.fmu"] = fmu.read_bytes()
         known = _base_units(description)
         # SSP describes each unit that a connector names.
-        unit_of = {v.name: v.unit for v in description.modelVariables if v.unit in known}
+        unit_of = {}
+        for variable in description.modelVariables:
+            if variable.unit in known:
+                unit_of[variable.name] = variable.unit
         connectors = []
         for kind, names in (("input", inputs), ("output", outputs)):
             for signal in names:
@@ -69,17 +76,26 @@ def write_ssp(
                 if unit is not None:
                     units[unit] = known[unit]
                 connectors.append((kind, signal, {"unit": unit}))
-        real = "Real" if version == "2" else "Float64"
-        component = {"name": name, "starts": name == "plant", "real": real}
+        component = {
+            "name": name,
+            "starts": name == "plant",
+            "real": "Real" if version == "2" else "Float64",
+        }
         components.append((component, connectors))
-    connections = [_connection("plant", "controller", signal) for signal in states]
-    connections += [_connection("controller", "plant", signal) for signal in actions]
+    connections = []
+    for signal in states:
+        connections.append(_connection("plant", "controller", signal))
+    for signal in actions:
+        connections.append(_connection("controller", "plant", signal))
     ssp = "1.0" if versions == {"2"} else "2.0"
-    parameters = _parameters(fmpy.read_model_description(str(plant)), starts)
-    members["resources/plant.ssv"] = render(
-        "parameters.ssv", version=ssp, name="plant", parameters=parameters
-    ).encode()
-    members["SystemStructure.ssd"] = render(
+    plant_description = fmpy.read_model_description(str(plant))
+    parameters = render(
+        "parameters.ssv",
+        version=ssp,
+        name="plant",
+        parameters=_parameters(plant_description, starts),
+    )
+    structure = render(
         "SystemStructure.ssd",
         version=ssp,
         name="loop",
@@ -87,7 +103,9 @@ def write_ssp(
         connections=connections,
         units=units,
         stop_time=float(stop_time),
-    ).encode()
+    )
+    members["resources/plant.ssv"] = parameters.encode()
+    members["SystemStructure.ssd"] = structure.encode()
     return write_archive(members, Path(target))
 
 
@@ -95,6 +113,7 @@ def _base_units(description: ModelDescription) -> dict[str, dict[str, float]]:
     """The attributes of BaseUnit of each unit that has one, by the unit's name."""
     units = {}
     for unit in description.unitDefinitions:
+        # A unit may be stated by its name alone.
         if unit.baseUnit:
             units[unit.name] = {key: getattr(unit.baseUnit, key) for key in BASE_UNIT}
     return units
@@ -110,10 +129,13 @@ def _connection(
 
 
 def _parameters(
-    plant: ModelDescription, starts: Mapping[str, tuple[str, float]]
+    plant: ModelDescription,
+    starts: Mapping[str, tuple[str, float]],
 ) -> list[tuple[str, str, str]]:
     """Name, element and text of each start value."""
-    types = {variable.name: variable.declaredType for variable in plant.modelVariables}
+    types = {}
+    for variable in plant.modelVariables:
+        types[variable.name] = variable.declaredType
     parameters = []
     for name, (kind, value) in starts.items():
         # Importers of FMI 2.0 set an enumeration through its number.
@@ -124,6 +146,7 @@ def _parameters(
         elif kind == "Boolean":
             text = "true" if value else "false"
         elif kind == "Enumeration":
+            # SSP names the item.
             names = {item.value: item.name for item in types[name].items}
             text = names[str(int(value))]
         else:

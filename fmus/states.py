@@ -24,7 +24,11 @@ def _variables(fmu: Path) -> tuple[bool, tuple[ElementTree.Element, ...]]:
     return is_fmi2, tuple(table)
 
 
-def _attribute(variable: ElementTree.Element, name: str, fmi2: bool) -> str:
+def _real_attribute(
+    variable: ElementTree.Element,
+    name: str,
+    fmi2: bool,
+) -> str:
     """An attribute of a real variable: FMI 2.0 has it at the type, a child; empty without one."""
     element = variable.find("Real") if fmi2 else variable
     # A variable of another type.
@@ -50,10 +54,16 @@ def continuous_states(fmu: Path) -> tuple[str, ...]:
         # FMI 2.0 counts from 1, FMI 3.0 points by the value reference.
         reference = str(position) if fmi2 else variable.get("valueReference", "")
         names[reference] = variable.get("name", "")
-        derivative = _attribute(variable, "derivative", fmi2)
+        # The rate names its state.
+        derivative = _real_attribute(variable, "derivative", fmi2)
         if derivative:
             derivatives.append(derivative)
-    return tuple(names[reference] for reference in derivatives if reference in names)
+    # A reference that leads nowhere is a flaw of the file, and no state.
+    states = []
+    for reference in derivatives:
+        if reference in names:
+            states.append(names[reference])
+    return tuple(states)
 
 
 def time_constants(fmu: Path) -> dict[str, float]:
@@ -70,7 +80,7 @@ def time_constants(fmu: Path) -> dict[str, float]:
     for variable in variables:
         name = variable.get("name", "")
         disturbance = name.removesuffix("_time_constant")
-        start = _attribute(variable, "start", fmi2)
+        start = _real_attribute(variable, "start", fmi2)
         if disturbance == name or not start:
             continue
         # 0 is a disturbance without memory.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,21 +16,23 @@ MOST_ROWS = 1000
 
 fmu_app = typer.Typer(help="Look into an FMU, check it, build ours.")
 
-FmuFileArgument = Annotated[
-    str,
-    typer.Argument(help="FMU file, or the name of a shipped one, evaporator_fmi3 or tanks, say."),
-]
+FmuFileArgument = Annotated[str, typer.Argument()]
 
 
 def _path(name: str) -> Path:
     import fmus
 
-    return fmus.path(name) if name in (*fmus.NAMES, *fmus.PLANTS) else Path(name)
+    shipped = (*fmus.NAMES, *fmus.PLANTS)
+    return fmus.path(name) if name in shipped else Path(name)
 
 
 @fmu_app.command("info")
 def show_fmu(file: FmuFileArgument = "evaporator", json: JsonOption = False) -> None:
-    """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
+    """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant.
+
+    Args:
+        file: FMU file, or the name of a shipped one, evaporator_fmi3 or tanks, say.
+    """
     with output(json) as out_:
         from cosim.core.errors import PlantError
         from cosim.plant.fmi import unpack
@@ -47,29 +50,47 @@ def show_fmu(file: FmuFileArgument = "evaporator", json: JsonOption = False) -> 
         about = information(_path(file), description)
         binaries = []
         for platform, made_for in about["platforms"].items():
-            binaries.append(f"{platform} ({', '.join(made_for)})" if made_for else platform)
-        out_.note(
-            f"{about['path']}\nsha256 {about['sha256']}\n{about['name']}: {about['description']}\n"
-            f"FMI {about['fmi_version']}: {', '.join(about['flags'])}"
-        )
+            # Sources are made for no platform.
+            if made_for:
+                binaries.append(f"{platform} ({', '.join(made_for)})")
+            else:
+                binaries.append(platform)
+        interfaces = about["flags"]
+        out_.note(about["path"])
+        out_.note(f"sha256 {about['sha256']}")
+        out_.note(f"{about['name']}: {about['description']}")
+        out_.note(f"FMI {about['fmi_version']}: {', '.join(interfaces)}")
         out_.note(f"binaries: {', '.join(binaries)}")
-        out_.note("\n".join(f"no plant: {reason}" for reason in refused) or "the plant accepts it")
-        faces = about["flags"].values()
-        names: dict[str, None] = {}
-        for face in faces:
-            names |= dict.fromkeys(face)
-        flags = []
-        for name in names:
-            flags.append((name, *(face.get(name, "–") for face in faces)))
-        out_.table("capability flags", ("flag", *about["flags"]), flags)
+        for reason in refused:
+            out_.note(f"no plant: {reason}")
+        if not refused:
+            out_.note("the plant accepts it")
+        out_.table("capability flags", ("flag", *interfaces), _flag_rows(interfaces))
         header = ("name", "causality", "unit", "start", "min", "max")
         rows = []
         for variable in about["variables"][:MOST_ROWS]:
             rows.append([str(variable[key] or "") for key in header])
         count = len(about["variables"])
-        more = f", the first {MOST_ROWS} here, all with --json" if count > MOST_ROWS else ""
-        out_.table(f"{count} variables{more}", header, rows)
+        title = f"{count} variables"
+        if count > MOST_ROWS:
+            title += f", the first {MOST_ROWS} here, all with --json"
+        out_.table(title, header, rows)
         out_.json(about | {"refusals": refused})
+
+
+def _flag_rows(interfaces: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
+    """A row for each capability flag, a column for each interface; a dash where it states none."""
+    # In the order of the file; a dictionary keeps it, and each name once.
+    names: dict[str, None] = {}
+    for flags in interfaces.values():
+        names |= dict.fromkeys(flags)
+    rows = []
+    for name in names:
+        row = [name]
+        for flags in interfaces.values():
+            row.append(flags.get(name, "–"))
+        rows.append(row)
+    return rows
 
 
 @fmu_app.command("check")
@@ -97,6 +118,7 @@ def check_fmu(
     do not; 2: bad input.
 
     Args:
+        file: FMU file, or the name of a shipped one, evaporator_fmi3 or tanks, say.
         model: Model to compare with, module:factory.
         scenario: With --model: names the variables in place of the options, and bounds the points.
         points: With --model: number of points; default 100.
@@ -131,7 +153,8 @@ def check_fmu(
         path = Path(file).absolute()
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", FmuWarning)  # the table says the same
+                # The table says the same.
+                warnings.simplefilter("ignore", FmuWarning)
                 outcome = check_plant(
                     file,
                     states=split_names(states),
@@ -139,12 +162,15 @@ def check_fmu(
                     stage_cost=cost,
                     sampling_time=sampling_time,
                 )
+        # Of a file that is there this is the answer, and no error.
         except PlantError as error:
             if not path.is_file():
                 raise
             outcome = PlantCheck(path, False, f"it cannot be a plant: {error}", ())
         header = ("checked", "found", "what follows")
-        rows = [(row.subject, row.finding, row.consequence) for row in outcome.rows]
+        rows = []
+        for row in outcome.rows:
+            rows.append((row.subject, row.finding, row.consequence))
         if rows:
             out_.table(str(outcome.fmu), header, rows)
         if outcome.remarks:
@@ -212,8 +238,9 @@ def build_fmu(
             differing = compare_with_shipped()
             for name, members in differing.items():
                 out_.note(f"{name}: {', '.join(members) or 'identical to the one shipped'}")
-            out_.json({"identical": not any(differing.values()), "differing": differing})
-            if any(differing.values()):
+            identical = not any(differing.values())
+            out_.json({"identical": identical, "differing": differing})
+            if not identical:
                 raise typer.Exit(1)
             return
         if out is None:
@@ -225,4 +252,5 @@ def build_fmu(
             built = build_fmus(writable_folder(out), every_platform=every)
         for path in built:
             out_.note(f"built {path}")
-        out_.json({"built": [str(path) for path in built]})
+        paths = [str(path) for path in built]
+        out_.json({"built": paths})

@@ -38,12 +38,16 @@ def compare(
         second = comparison.load_run(b)
         # Of a folder the command line knows only the folder, not the file in it.
         protect([first.name, second.name])
-        tolerances = dict(_read_tolerance(option) for option in tolerance or [])
+        tolerances = {}
+        for option in tolerance or []:
+            name, value = _read_tolerance(option)
+            tolerances[name] = value
         result = comparison.compare(first, second, tolerances, relative=relative)
         differences = result.lines() or ["no signal differs by more than its tolerance"]
         if record is not None:
             from cosim.recording import record_overlay
 
+            # Markdown, which the viewer shows beside the signals.
             items = [f"- {text}" for text in differences]
             about = "\n".join(["# A against B", "", *items])
             # Two runs may have one label.
@@ -53,6 +57,7 @@ def compare(
         rows = []
         for difference in result.differences:
             allowed = difference.tolerance
+            # Of a signal without a difference there is no place of the largest.
             row = (
                 difference.name,
                 difference.unit,

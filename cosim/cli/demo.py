@@ -49,40 +49,42 @@ def demo(
         folder = cli.open_folder(out)
         out_.note(scenario.description)
         trained = {}
-        for name, rule, start, number in (
-            (BACKED_OFF, "backoff", "tuned", BACK_OFF_SAMPLES),
-            (LEARNED, "q-learning", "tuned", samples),
+        # The search of a back-off takes no more samples, however long the other learns.
+        for name, rule, number in (
+            (BACKED_OFF, "backoff", BACK_OFF_SAMPLES),
+            (LEARNED, "q-learning", samples),
         ):
+            # Ten points of the learning curve.
             every = max(1, number // 10)
             trained[name] = cosim.train(
                 rule,
                 SCENARIO,
                 number,
                 seed=seed,
-                start=start,
+                start="tuned",
                 log_every=every,
                 evaluate_every=every,
                 checkpoint_every=every,
                 progress=out_.live,
             )
-        first = 2 * HELD_OUT + seed  # noise that no training met
+        # Noise that no training met.
+        first = 2 * HELD_OUT + seed
+        runs = {}
+        signals = {}
         with temporary_folder("cosim-demo-") as work, cosim.FmuPlant(scenario) as plant:
+            # In the order of the table.
             named = {"naive": "naive", BACKED_OFF: "", LEARNED: "", "optimal": "optimal"}
             for name, training in trained.items():
-                named[name] = str(training.parameters.save(work / f"{training.run.algorithm}.toml"))
+                file = work / f"{training.run.algorithm}.toml"
+                named[name] = str(training.parameters.save(file))
             seeds = range(first, first + COMPARED_RUNS)
             evaluation = cosim.evaluate(scenario, named, seeds, steps, progress=out_.live)
-            runs = {
-                name: cosim.simulate(
-                    plant, cosim.build_controller(named[name], scenario), steps, first
-                )
-                for name in ("naive", LEARNED, "optimal")
-            }
+            for name in ("naive", LEARNED, "optimal"):
+                controller = cosim.build_controller(named[name], scenario)
+                run = cosim.simulate(plant, controller, steps, first)
+                runs[name] = run
+                signals[name] = RunSignals(name, run.signals, run.status, scenario.limits)
         summary = evaluation.summary() | {"training": trained[LEARNED].summary()}
-        signals = {
-            name: RunSignals(name, run.signals, run.status, scenario.limits)
-            for name, run in runs.items()
-        }
         with staged(folder) as stage:
             evaluation.write_files(stage)
             save(overlay_figure(runs), stage / "before-after.png")

@@ -50,10 +50,15 @@ def evaluate(
             return
         names = []
         for text in controllers:
-            names += [name for name in text.split(",") if name.strip()]
+            for name in text.split(","):
+                if name.strip():
+                    names.append(name)
         named = named_controllers(names)
         # The command that makes the same numbers anew, for whoever finds the files.
-        words = ["--scenario", scenario, "--controllers", ",".join(names), "--seeds", str(seeds)]
+        words = ["cosim", "evaluate"]
+        words += ["--scenario", scenario]
+        words += ["--controllers", ",".join(names)]
+        words += ["--seeds", str(seeds)]
         if first_seed > 0:
             words += ["--first-seed", str(first_seed)]
         words += ["--steps", str(steps)]
@@ -67,7 +72,7 @@ def evaluate(
             jobs=jobs,
             scheduler=scheduler,
             progress=out_.live,
-            command=shlex.join(["cosim", "evaluate", *words]),
+            command=shlex.join(words),
         )
         summary = evaluation.summary()
         # All files or none: a table and a summary in a folder are of one evaluation.
@@ -80,7 +85,10 @@ def evaluate(
 
 
 def _evaluate_trajectories(
-    scenario: cosim.Scenario, trajectories: Path, folder: Path, output: cli.Output
+    scenario: cosim.Scenario,
+    trajectories: Path,
+    folder: Path,
+    output: cli.Output,
 ) -> None:
     """Recompute the costs of loops that another tool ran; print and write them."""
     from cosim.core.statistics import mean, regret, shown
@@ -92,8 +100,14 @@ def _evaluate_trajectories(
     violating_share = table["violating_share"].mean()
     rows = []
     for run in table.itertuples():
-        percent = f"{100 * run.regret:.3f}"
-        rows.append((run.file, str(run.seed), str(run.steps), shown(run.J, digits=6), percent))
+        row = (
+            run.file,
+            str(run.seed),
+            str(run.steps),
+            shown(run.J, digits=6),
+            f"{100 * run.regret:.3f}",
+        )
+        rows.append(row)
     summary = {
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,
@@ -102,15 +116,23 @@ def _evaluate_trajectories(
         "regret": regret(cost, optimum)._asdict(),
         "violating_share": float(violating_share),
     }
+    # The files of another evaluation in the folder go: they are of other runs.
     with staged(folder, EVALUATION_FILES) as stage:
-        write_atomically(stage / "judged.csv", table.to_csv(index=False))
+        text = table.to_csv(index=False)
+        write_atomically(stage / "judged.csv", text)
         cli.write_summary(stage, summary)
-    output.table("judged runs", ("file", "seed", "steps", "J", "regret %"), rows)
+    header = ("file", "seed", "steps", "J", "regret %")
+    output.table("judged runs", header, rows)
     output.json(summary)
 
 
 def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
-    """Print the table of controllers and the paired comparisons."""
+    """Print the table of controllers and the paired comparisons.
+
+    Args:
+        summary: `Evaluation.summary`.
+        output: of the command.
+    """
     from cosim.core.statistics import shown
 
     header = (
@@ -121,23 +143,23 @@ def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
         timing = summary["timing"][name]
         # What the controller takes of a sample; the plant's time is no merit of it.
         step = timing["prepare_median_us"] + timing["feedback_median_us"]
-        rows.append(
-            (
-                name,
-                shown(row["J"], digits=6),
-                _interval(row.get("regret"), 100.0),
-                shown(row["economic_cost"], digits=6),
-                f"{100 * row['violating_share']:.2f}",
-                str(row["failures"]),
-                f"{step:.0f}",
-            )
+        cells = (
+            name,
+            shown(row["J"], digits=6),
+            _interval(row.get("regret"), 100.0),
+            shown(row["economic_cost"], digits=6),
+            f"{100 * row['violating_share']:.2f}",
+            str(row["failures"]),
+            f"{step:.0f}",
         )
+        rows.append(cells)
     # A column that is known of no controller is left out.
-    known = [any(cells) for cells in zip(*rows, strict=True)]
+    known = [any(column) for column in zip(*rows, strict=True)]
+    titles = list(compress(header, known))
     lines = [list(compress(row, known)) for row in rows]
     n_seeds = len(summary["seeds"])
     title = f"{summary['scenario']}, {summary['steps']} samples × {n_seeds} seeds"
-    output.table(title, list(compress(header, known)), lines)
+    output.table(title, titles, lines)
     if "remark" in summary:
         output.note(summary["remark"])
     if summary["optimum"] is not None:

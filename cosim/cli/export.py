@@ -56,7 +56,9 @@ def export(
             if format_ == "fmu":
                 check_target(target)
         loaded = cosim.Scenario.load(scenario)
-        names = tuple(dict.fromkeys(split_names(measured)))
+        # Each once: a name twice would be two inputs.
+        words = split_names(measured)
+        names = tuple(dict.fromkeys(words))
         missing = set(names) - set(loaded.plant.disturbances)
         # In the SSP the plant is what measures them; elsewhere the user connects them.
         if ssp is not None and missing:
@@ -71,10 +73,16 @@ def export(
             return
         if single:
             raise CosimError("--single goes with --format c: an FMU's numbers are doubles")
+        # The cross-compiler is an extra of this package.
         every_platform = not local and find_spec("ziglang") is not None
         version: FmiVersion = 3 if fmi == 3 else 2
         path = controller_fmu.write_fmu(
-            rti, loaded, out, version, measured=names, every_platform=every_platform
+            rti,
+            loaded,
+            out,
+            version,
+            measured=names,
+            every_platform=every_platform,
         )
         built_for = PLATFORMS if every_platform else [present()]
         platforms = [platform.tuple for platform in built_for]
@@ -89,6 +97,7 @@ def export(
             "sampling_time": loaded.sampling_time,
         }
         if ssp is not None:
-            document["ssp"] = str(controller_fmu.write_loop(path, loaded, seed, ssp, names))
+            written = controller_fmu.write_loop(path, loaded, seed, ssp, names)
+            document["ssp"] = str(written)
             out_.note(f"wrote {ssp}")
         out_.json(document)

@@ -61,7 +61,12 @@ class _Commands(TyperGroup):
     """Command group; refuses empty arguments."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse empty words: as a path, one would mean the working directory; protect inputs."""
+        """Refuse empty words: as a path, one would mean the working directory; protect inputs.
+
+        Args:
+            ctx: Click's context.
+            args: words of the command line.
+        """
         inputs: list[str] = []
         for before, word in pairwise(["", *args]):
             # A value stands behind its option, or with it: `--out DIR`, `--out=DIR`.

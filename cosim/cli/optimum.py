@@ -39,6 +39,7 @@ def optimum(
         from cosim.core.scenario import is_file
 
         task = cosim.Scenario.load(scenario)
+        # Of a foreign FMU it is not known which instant its cost belongs to.
         if is_file(task.plant.fmu):
             out_.announce(task.plant.fmu)
             with cosim.FmuPlant(task) as plant:
@@ -64,7 +65,8 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cl
         row = {name: values[position] for name, values in drifting.items()}
         row["J"] = gain
         table.append(row)
-        rows.append([f"{value:.4f}" for value in row.values()])
+        cells = [f"{value:.4f}" for value in row.values()]
+        rows.append(cells)
     # The mean stands under the first parameter, the cells of the others stay empty.
     blanks = [""] * (len(names) - 1)
     rows.append(["mean", *blanks, f"{policy.gain:.4f}"])
@@ -94,25 +96,33 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     if not (refine or recompute):
         path = store.stored_file(key)
     show = _show_rounds(out_)
-    solution = store.read_optimum(path, key) if path else solve(plant, settings, progress=show)
+    if path is not None:
+        solution = store.read_optimum(path, key)
+    else:
+        solution = solve(plant, settings, progress=show)
     if refine:
         solution = certify(plant, settings, solution, progress=show)
-    path = path or store.keep(key, solution)
+    if path is None:
+        path = store.keep(key, solution)
     certificate = solution.certificate
-    why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
+    why_not: str | None = "no certificate; make one with --refine"
+    if certificate:
+        why_not = objection(certificate)
+    # A memory that no controller sees outweighs any agreement of the figures.
     if plant.unseen:
         why_not = (
             f"its policy knows what {plant.unseen} was in the sample before, which no controller "
             "is told: a bound from below"
         )
     kind = "reference" if why_not else "optimum"
-    figures = certificate or [
-        GainEstimate("solution", solution.gain, solution.lower, solution.upper)
-    ]
+    own_gain = GainEstimate("solution", solution.gain, solution.lower, solution.upper)
+    estimates = certificate or [own_gain]
     rows = []
-    for name, *numbers in figures:
-        rows.append((name, *[f"{number:.4f}" for number in numbers]))
-    states = " × ".join(str(count) for count in solution.grid.shape)
+    for name, *numbers in estimates:
+        cells = [f"{number:.4f}" for number in numbers]
+        rows.append((name, *cells))
+    sizes = [str(count) for count in solution.grid.shape]
+    states = " × ".join(sizes)
     title = f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states"
     out_.table(title, ("", "J", "from", "to"), rows)
     if why_not is not None:
@@ -135,12 +145,20 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
 def _show_rounds(out_: cli.Output) -> RoundProgress:
     """Note each round on a terminal: the grid and the closing bounds."""
 
-    def note(level: int, number: int, solution: Optimum) -> None:
-        if out_.live:
-            where = f"grid {level} ({solution.grid.size} states), round {number}"
-            out_.note(f"{where}: {solution.lower:.1f} ≤ J* ≤ {solution.upper:.1f}")
+    def show(level: int, number: int, solution: Optimum) -> None:
+        """Print the round `number` on the grid `level`.
 
-    return note
+        Args:
+            level: of the grid, from 0.
+            number: of the round on it.
+            solution: as far as it is.
+        """
+        if not out_.live:
+            return
+        where = f"grid {level} ({solution.grid.size} states), round {number}"
+        out_.note(f"{where}: {solution.lower:.1f} ≤ J* ≤ {solution.upper:.1f}")
+
+    return show
 
 
 def tuning(
@@ -167,17 +185,21 @@ def tuning(
         task = cosim.Scenario.load(scenario)
         problem = Problem.from_scenario(task)
         result = tune(problem)
-        parameters = result.parameters.replace({"c_lambda": value_offset(task, problem)})
-        steady, convex = result.steady_state, result.convexification
+        # The scenario says it, and no economics.
+        offset = value_offset(task, problem)
+        parameters = result.parameters.replace({"c_lambda": offset})
+        steady = result.steady_state
+        convex = result.convexification
         rows = []
         for line in str(result).splitlines():
+            # Two blanks at least stand between the columns of the text.
             subject, _, words = line.partition("  ")
             rows.append((subject, words.strip()))
         out_.table(f"economic tuning of {scenario}", ("", "result"), rows)
         if out is not None:
             parameters.save(out)
             out_.note(f"θ {parameters.hash} is in {out.resolve()}")
-        states, actions = steady.x.tolist(), steady.u.tolist()
+        # Of all multipliers those of the active bounds.
         prices = (steady.C @ steady.multipliers).tolist()
         addition = None
         if result.addition is not None:
@@ -188,9 +210,14 @@ def tuning(
                 "reason": result.addition.reason,
                 "meaning": str(result.addition),
             }
+        steady_state = {
+            "states": steady.x.tolist(),
+            "actions": steady.u.tolist(),
+            "cost": steady.cost,
+        }
         document = {
             "scenario": scenario,
-            "steady_state": {"states": states, "actions": actions, "cost": steady.cost},
+            "steady_state": steady_state,
             "active": dict(zip(steady.active, prices, strict=True)),
             "economic_eigenvalues": np.linalg.eigvalsh(steady.hessian).tolist(),
             "convexified_eigenvalues": np.linalg.eigvalsh(convex.hessian).tolist(),

@@ -25,7 +25,12 @@ LONG_DOCUMENT = 1 << 20
 
 
 def count(*names: str, text: str | None = None) -> Any:
-    """An option that is a number of samples."""
+    """An option that is a number of samples.
+
+    Args:
+        names: of the option, `--steps` say.
+        text: of the help; None where the command's docstring has it.
+    """
     return typer.Option(*names, min=1, max=MOST, help=text)
 
 
@@ -87,11 +92,21 @@ class Output:
             # A bar that is being drawn turns standard error to itself.
             print(text, file=sys.stderr)
 
-    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    def table(
+        self,
+        title: str,
+        header: Sequence[str],
+        rows: Sequence[Sequence[str]],
+    ) -> None:
         """Print a table, columns of numbers right justified and the others left.
 
         A file or pipe gets it as wide as it is. On a terminal that is too narrow, columns that do
         not fit go to further tables below, each with the first column; wide texts are folded.
+
+        Args:
+            title: a line above it.
+            header: titles of the columns.
+            rows: of texts, one for each column.
         """
         if self.as_json:
             return
@@ -110,15 +125,17 @@ class Output:
             columns.append(cells)
             # Cells are never folded; a heading may be, but that of the first column.
             words = name.split() if widths else [name]
-            longest = max(len(word) for word in [*cells, *words, ""])
+            lengths = [len(word) for word in (*cells, *words)]
             # A border, and a space on either side.
-            widths.append(longest + 3)
+            width = max(lengths, default=0) + 3
+            widths.append(width)
         for part in _fitting_tables(widths, console.width - 1):
             table = Table(title=escape(title), title_justify="left", min_width=len(title))
             for number in part:
                 is_numeric = all(_is_number(cell) for cell in columns[number])
                 justify: Any = "right" if is_numeric else "left"
-                table.add_column(escape(header[number]), justify=justify, overflow="fold")
+                heading = escape(header[number])
+                table.add_column(heading, justify=justify, overflow="fold")
             for row in rows:
                 # Rich would read `[X2]` as a style.
                 cells = [escape(row[number]) for number in part]
@@ -166,11 +183,15 @@ def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:
 
 def _is_number(cell: str) -> bool:
     """Whether a cell begins with a number, or is empty."""
+    # A dash says that there is none.
+    if cell.strip() in ("", "–"):
+        return True
     # An interval stands behind its value: `1.2 [1.1, 1.3]`.
+    first, *_ = cell.split()
     try:
-        float(cell.split(maxsplit=1)[0].strip("()[],"))
-    except (IndexError, ValueError):
-        return cell.strip() in ("", "–")
+        float(first.strip("()[],"))
+    except ValueError:
+        return False
     return True
 
 
@@ -208,23 +229,44 @@ def resumable(
 
 
 @contextmanager
-def followed(out: Output, label: str, samples: int) -> Iterator[Callable[[int, str, str], None]]:
-    """The `progress` of resumable work on so many samples: a bar, and a line for each event."""
+def followed(
+    out: Output,
+    label: str,
+    samples: int,
+) -> Iterator[Callable[[int, str, str], None]]:
+    """The `progress` of resumable work: a bar, and a line for each event.
+
+    Args:
+        out: of the command.
+        label: what the bar is called.
+        samples: of the whole work.
+
+    Yields:
+        What is called with the samples done, the runs done in words, and a line about an event,
+        or "".
+    """
     from cosim.core.simulation import reporting
 
     with resumable(), reporting(out.live, label, samples) as bar:
 
-        def report(samples: int, runs: str, line: str) -> None:
-            bar(samples, runs)
+        def tell(n_done: int, runs: str, line: str) -> None:
+            bar(n_done, runs)
             if line:
-                out.note(f"{runs}  {line}".strip())
+                text = f"{runs}  {line}"
+                out.note(text.strip())
 
-        yield report
+        yield tell
 
 
 def write_summary(folder: Path, document: Mapping[str, Any]) -> None:
-    """Write summary.json."""
-    write_atomically(folder / "summary.json", dump(document))
+    """Write summary.json.
+
+    Args:
+        folder: where it goes.
+        document: numbers, words, lists and tables.
+    """
+    text = dump(document)
+    write_atomically(folder / "summary.json", text)
 
 
 def dump(document: Mapping[str, Any]) -> str:
@@ -232,11 +274,12 @@ def dump(document: Mapping[str, Any]) -> str:
     from pydantic_core import to_json
 
     # Pydantic's knows NumPy's numbers and paths, Python's sorts the keys.
-    text = to_json(dict(document), inf_nan_mode="null")
-    plain = json.loads(text)
-    is_long = len(text) >= LONG_DOCUMENT
+    unsorted = to_json(dict(document), inf_nan_mode="null")
+    plain = json.loads(unsorted)
+    is_long = len(unsorted) >= LONG_DOCUMENT
     indent = None if is_long else 2
-    return json.dumps(plain, indent=indent, sort_keys=True) + "\n"
+    text = json.dumps(plain, indent=indent, sort_keys=True)
+    return f"{text}\n"
 
 
 def open_folder(folder: Path) -> Path:

@@ -19,7 +19,12 @@ class ShowByDefault(TyperGroup):
     """`cosim scenario NAME` is `cosim scenario show NAME`."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Put `show` first where no command is named."""
+        """Put `show` first where no command is named.
+
+        Args:
+            ctx: Click's context.
+            args: words after `cosim scenario`.
+        """
         known = {*self.commands, *ctx.help_option_names}
         if not args or args[0] not in known:
             args = ["show", *args]
@@ -59,8 +64,10 @@ def show_scenario(
         chosen = cosim.Scenario.load(name)
         if seed is not None:
             values = _seed_values(chosen, seed)
-            # As JSON, so that a Boolean is `true` as in the FMU, not `True`.
-            lines = [f"{key} = {dumps(value)}" for key, value in values.items()]
+            lines = []
+            for key, value in values.items():
+                # As JSON, so that a Boolean is `true` as in the FMU, not `True`.
+                lines.append(f"{key} = {dumps(value)}")
             out_.note("\n".join(lines))
             out_.json({"hash": chosen.hash, "seed": seed, "start_values": values})
             return
@@ -68,7 +75,8 @@ def show_scenario(
             out_.json(chosen.to_dict() | {"hash": chosen.hash})
         else:
             # The hash is a comment: what is printed is a scenario file.
-            print(f"# hash {chosen.hash}\n{chosen.to_toml()}", end="")
+            print(f"# hash {chosen.hash}")
+            print(chosen.to_toml(), end="")
 
 
 def _seed_values(scenario: cosim.Scenario, seed: int) -> dict[str, float | bool | int]:
@@ -146,6 +154,7 @@ def draft(
         write_atomically(target, text)
         # As any later command reads it.
         drafted = cosim.Scenario.load(target)
+        # The text ends its last line itself.
         if not json:
             print(text, end="")
         if drafted.disturbance.law == "none":
@@ -171,15 +180,20 @@ def _with_enough_substeps(text: str, scenario: cosim.Scenario) -> str:
     from controllers.integration import measure_integration
     from controllers.problem import Problem
 
-    integration = measure_integration(Problem.from_scenario(scenario))
-    if not integration.coarse or integration.suffices is None:
+    problem = Problem.from_scenario(scenario)
+    integration = measure_integration(problem)
+    substeps = integration.suffices
+    # Of a model that no number of steps makes accurate the default stays.
+    if not integration.coarse or substeps is None:
         return text
-    line = f"substeps = {integration.suffices} # so that the model is accurate at the bounds"
-    return text.replace("[controller]\n", f"[controller]\n{line}\n", 1)
+    heading = "[controller]\n"
+    line = f"substeps = {substeps} # so that the model is accurate at the bounds\n"
+    return text.replace(heading, heading + line, 1)
 
 
 def _numbers(text: str, option: str) -> list[float]:
+    words = cli.split_names(text)
     try:
-        return [float(word) for word in cli.split_names(text)]
+        return [float(word) for word in words]
     except ValueError:
         raise CosimError(f"{option} takes numbers, comma-separated, not '{text}'") from None

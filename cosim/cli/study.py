@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from cosim.cli import output as cli
 study_app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 results_app = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
 
-StudyFileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+StudyFileArgument = Annotated[Path, typer.Argument(show_default=False)]
 NamesArgument = Annotated[
     list[str] | None, typer.Argument(help="Studies; default: all that apply.")
 ]
@@ -32,6 +33,9 @@ def run_study(
     Writes evaluation.csv, curves.csv, runs.csv, summary.csv, study.json, summary.json, timing.csv.
     Run again with the same --out to go on after an interruption, a failure or a change of the
     file: what is finished is not done again. Exit code 1: some runs failed, all others are done.
+
+    Args:
+        file: Study file (TOML).
     """
     with cli.output(json) as out_:
         results = _execute(file, out, out_, jobs=jobs, scheduler=scheduler)
@@ -81,24 +85,30 @@ def _execute(
 
 @study_app.command("plan")
 def show_plan(file: StudyFileArgument, json: cli.JsonOption = False) -> None:
-    """Show the runs of a study and the plant samples that they take: nothing is run or written."""
-    with cli.output(json) as out_:
-        import pandas as pd
+    """Show the runs of a study and the plant samples that they take: nothing is run or written.
 
+    Args:
+        file: Study file (TOML).
+    """
+    with cli.output(json) as out_:
         from cosim.studies.plan import plan
 
         planned = plan(cosim.Study.load(file))
-        columns = ["scenario", "case", "runs", "plant samples"]
-        runs = [(run.scenario.name, run.case, 1, run.samples) for run in planned.runs]
-        # In the order of the study's file, as its reports have it.
-        cases = pd.DataFrame(runs, columns=columns).groupby(columns[:2], sort=False, as_index=False)
-        rows = cases.sum()
-        out_.table(
-            f"{planned.definition.name}: {len(planned.runs)} runs, {planned.samples} plant samples",
-            tuple(rows),
-            rows.astype(str).to_numpy().tolist(),
-        )
-        out_.json({"runs": len(planned.runs), "samples": planned.samples})
+        n_runs = len(planned.runs)
+        # In the order of the study's file, as its reports have it: a dictionary keeps it.
+        runs_of: dict[tuple[str, str], int] = Counter()
+        samples_of: dict[tuple[str, str], int] = Counter()
+        for run in planned.runs:
+            key = (run.scenario.name, run.case)
+            runs_of[key] += 1
+            samples_of[key] += run.samples
+        rows = []
+        for key, count in runs_of.items():
+            rows.append((*key, str(count), str(samples_of[key])))
+        title = f"{planned.definition.name}: {n_runs} runs, {planned.samples} plant samples"
+        header = ("scenario", "case", "runs", "plant samples")
+        out_.table(title, header, rows)
+        out_.json({"runs": n_runs, "samples": planned.samples})
 
 
 @study_app.command("report")
@@ -134,16 +144,22 @@ def _summary(results: cosim.StudyResults) -> dict[str, Any]:
     timing = read_table(results.folder / TIMING, needed=["run"])
     # JSON has null for a rank that is missing.
     summary = results.summary.astype({"rank": object})
-    summary["rank"] = summary["rank"].where(summary["rank"].notna(), None)
+    ranks = summary["rank"]
+    summary["rank"] = ranks.where(ranks.notna(), None)
+    timing_of_runs = timing.set_index("run")
     return {
         **results.about,
         "summary": summary.to_dict("records"),
         "aggregate": results.aggregate.to_dict("records"),
-        "timing": timing.set_index("run").to_dict("index"),
+        "timing": timing_of_runs.to_dict("index"),
     }
 
 
-def _show_tables(results: cosim.StudyResults, out_: cli.Output, columns: str | None = None) -> None:
+def _show_tables(
+    results: cosim.StudyResults,
+    out_: cli.Output,
+    columns: str | None = None,
+) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
     from cosim.studies.report_tables import REPORT_COLUMNS, SHORT_COLUMNS
 
@@ -177,10 +193,12 @@ def reproduce(
         from cosim.studies.stored import stored_results
 
         name = "reproduce" if budget == "quick" else "reproduce-full"
-        results = _execute(stored_results() / f"{name}.toml", out, out_, jobs=jobs)
+        file = stored_results() / f"{name}.toml"
+        results = _execute(file, out, out_, jobs=jobs)
         page = results.report()
         _show_tables(results, out_)
-        out_.table(*results.paper())
+        title, header, rows = results.paper()
+        out_.table(title, header, rows)
         out_.note(f"the report is {page.resolve()}")
         summary = _summary(results)
         cli.write_summary(results.folder, summary)
@@ -223,8 +241,10 @@ def check_results(
         with temporary_folder("cosim-results-") as work:
             for name in chosen:
                 now = work / name
-                _execute(folder / f"{name}.toml", now, out_, jobs=jobs, figures=False)
-                differences[name] = stored.table_differences(name, folder / name, now, tolerances)
+                definition = folder / f"{name}.toml"
+                _execute(definition, now, out_, jobs=jobs, figures=False)
+                before = folder / name
+                differences[name] = stored.table_differences(name, before, now, tolerances)
         rows = []
         for name in studies:
             verdict = "not recomputed"
@@ -263,9 +283,11 @@ def update_results(
         for name in stored.chosen(studies, names or list(studies)):
             # Beside the stored tables, which are replaced when all runs are done.
             out = folder / stored.WORK / name
-            _execute(folder / f"{name}.toml", out, out_, jobs=jobs).report()
+            results = _execute(folder / f"{name}.toml", out, out_, jobs=jobs)
+            results.report()
             for table in stored.store(folder, name, out):
                 out_.note(f"{name}: {table} is too large to be stored")
+        # One page for all studies, those that were not run now too.
         stored.write_readme(folder, studies)
         out_.note(f"stored {', '.join(names or studies)} in {folder.resolve()}")
         out_.json({"updated": list(names or studies)})
@@ -288,9 +310,11 @@ def draw_results(
         from cosim.studies import stored
 
         studies = stored.stored_studies(folder)
+        # A study whose tables are not stored has nothing to draw.
         kept = [name for name in studies if (folder / name).is_dir()]
         drawn = {}
         for name in stored.chosen(studies, names or kept):
-            drawn[name] = stored.draw_stored(folder, name)
-            out_.note(f"{name}: {len(drawn[name])} figures in {folder / name / 'figures'}")
+            figures = stored.draw_stored(folder, name)
+            drawn[name] = figures
+            out_.note(f"{name}: {len(figures)} figures in {folder / name / 'figures'}")
         out_.json({"figures": drawn})

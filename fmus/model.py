@@ -438,7 +438,12 @@ def terminals(model: FmuModel, icon: bool = False) -> dict[str, bytes]:
 
 
 def build_description(version: FmiVersion, model: FmuModel) -> str:
-    """The text of sources/buildDescription.xml: one C99 source file, linked with libm."""
+    """The text of sources/buildDescription.xml: one C99 source file, linked with libm.
+
+    Args:
+        version: major version of FMI.
+        model: names the library.
+    """
     return render("buildDescription.xml", version=version, model=model)
 
 

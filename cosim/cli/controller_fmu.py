@@ -97,10 +97,10 @@ def sampled_controller(
     exported = core(problem, parameters, hessian)
     # The order is that of the C's arrays: inputs, outputs, predictions, θ.
     signals = [
-        *_inputs(controller, scenario, measured),
-        *_outputs(scenario),
-        *_predictions(scenario, problem.horizon),
-        *_theta(parameters),
+        *_input_signals(controller, scenario, measured),
+        *_output_signals(scenario),
+        *_prediction_signals(scenario, problem.horizon),
+        *_theta_signals(parameters),
     ]
     # Another controller has another name in C, so that both may be linked into one program.
     origin = f"{scenario.hash} {hessian} {parameters.hash}"
@@ -120,7 +120,7 @@ def sampled_controller(
     )
 
 
-def _inputs(
+def _input_signals(
     controller: RtiNmpc,
     scenario: Scenario,
     measured: tuple[str, ...],
@@ -140,6 +140,7 @@ def _inputs(
             description="measured state",
         )
         signals.append(state)
+    # Off where a tool connects nothing to it.
     manual = Variable(
         "manual",
         Kind.INPUT,
@@ -172,7 +173,7 @@ def _inputs(
     return signals
 
 
-def _outputs(scenario: Scenario) -> list[Variable]:
+def _output_signals(scenario: Scenario) -> list[Variable]:
     """The actions, and what the controller reports of a sample."""
     plant = unpack(scenario.plant.fmu)
     signals = []
@@ -200,7 +201,7 @@ def _outputs(scenario: Scenario) -> list[Variable]:
     return signals
 
 
-def _predictions(scenario: Scenario, horizon: int) -> list[Variable]:
+def _prediction_signals(scenario: Scenario, horizon: int) -> list[Variable]:
     """States and actions over the horizon, stage by stage."""
     plant = unpack(scenario.plant.fmu)
     signals = []
@@ -222,7 +223,7 @@ def _predictions(scenario: Scenario, horizon: int) -> list[Variable]:
     return signals
 
 
-def _theta(parameters: Parameters) -> list[Variable]:
+def _theta_signals(parameters: Parameters) -> list[Variable]:
     """The entries of θ, which are tunable: another θ may be set where the FMU runs."""
     meanings = []
     for block in parameters.blocks:
@@ -319,6 +320,7 @@ def write_fmu(
     system = sampled_controller(controller, scenario, measured)
     labels = controller.parameters.blocks.labels
     values = controller.theta.tolist()
+    # Whoever finds the FMU can tell what it was made of, and make it again.
     record = {
         "scenario": scenario.to_dict(),
         "scenario_hash": scenario.hash,
@@ -368,6 +370,7 @@ def write_loop(
     types = {}
     for name, variable in archive.variables.items():
         types[name] = variable.type
+    # A switch of our own plants, off by default: an input beyond its range is then refused.
     if "saturate" in types:
         starts["saturate"] = ("Boolean", 1.0)
     for name, (kind, value) in list(starts.items()):

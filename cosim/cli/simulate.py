@@ -101,6 +101,7 @@ def _simulate(
         from cosim.recording import RerunRecorder
 
         recorder = RerunRecorder(folder / "run.rrd")
+    # States within a step have no place but in a recording.
     between = recorder.intermediate if recorder else None
     with cosim.FmuPlant(scenario, intermediate=between) as plant:
         law = cosim.build_controller(controller, scenario)

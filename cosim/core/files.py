@@ -86,8 +86,12 @@ def _exchange(
 ) -> None:
     """Move files of `new` to a folder, and the owned ones that it lacks to `old`; all or none."""
     names = [path.relative_to(new) for path in sorted(new.rglob("*")) if path.is_file()]
-    earlier = {path.relative_to(folder) for pattern in owned for path in folder.glob(pattern)}
+    earlier = set()
+    for pattern in owned:
+        for path in folder.glob(pattern):
+            earlier.add(path.relative_to(folder))
     leaving = sorted(earlier - set(names))
+    # Whatever can fail is tried before the first file moves.
     for name in [*names, *leaving]:
         check_target(folder / name)
         for root in (old, folder):
@@ -107,6 +111,7 @@ def _exchange(
                 (folder / name).replace(old / name)
                 moved.append((old / name, folder / name))
         except OSError:
+            # All or none: what has moved already goes back.
             for before, now in moved:
                 if before.exists():
                     before.replace(now)
@@ -188,16 +193,21 @@ def cache_folder(kind: str, *, plain: bool = False) -> Path:
     if plain and not _is_plain(folder):
         # Windows has a folder of temporary files for each user.
         user = getattr(os, "getuid", int)()
-        folder = Path(tempfile.gettempdir()) / f"rti-cosim-{user}" / kind
+        system_folder = Path(tempfile.gettempdir())
+        folder = system_folder / f"rti-cosim-{user}" / kind
     if _is_ours_alone(folder):
         return folder
-    if folder not in _temporary or not _temporary[folder].is_dir():
-        _temporary[folder] = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))
-        atexit.register(shutil.rmtree, _temporary[folder], ignore_errors=True)
-    return _temporary[folder]
+    temporary = _temporary.get(folder)
+    # One for the process; a user may have tidied up meanwhile.
+    if temporary is None or not temporary.is_dir():
+        temporary = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        _temporary[folder] = temporary
+    return temporary
 
 
 def _is_plain(folder: Path) -> bool:
+    # A URI writes a blank as %20.
     return folder.as_uri().endswith(folder.as_posix())
 
 

@@ -145,7 +145,15 @@ class Signals:
         return _ahead(self.tables[i], self._scenario)
 
     def value(self, i: int, k: int) -> float:
-        """Value of signal i at sample k; raises ScenarioError beyond its end."""
+        """Value of a signal at a sample.
+
+        Args:
+            i: number of the signal in `tables`.
+            k: number of the sample.
+
+        Raises:
+            ScenarioError: the signal has ended before.
+        """
         if k >= len(self._at_samples[i]):
             self._find_values(i, k + 1)
         return float(self._at_samples[i][k])
@@ -246,14 +254,30 @@ class Signals:
         )
 
     def penalties_along(self, states: Array, samples: NDArray[np.intp]) -> Array:
-        """Penalties (K,) of states (K, n) at the bounds of their samples (K,)."""
+        """Penalty of each state at the bounds of its sample.
+
+        Args:
+            states: (K, n).
+            samples: their numbers, (K,).
+
+        Returns:
+            (K,).
+        """
         total = np.empty(len(states))
         for penalty, rows in self._by_penalty(samples):
             total[rows] = penalty.along(states[rows])
         return total
 
     def violations_along(self, states: Array, samples: NDArray[np.intp]) -> Array:
-        """Violations (K, n) of states (K, n) at the bounds of their samples (K,)."""
+        """Violation of each state at the bounds of its sample.
+
+        Args:
+            states: (K, n).
+            samples: their numbers, (K,).
+
+        Returns:
+            (K, n), in the states' units.
+        """
         violations = np.empty(states.shape)
         for penalty, rows in self._by_penalty(samples):
             violations[rows] = penalty.violation(states[rows])
@@ -319,5 +343,15 @@ def signals_of(scenario: Scenario) -> Signals | None:
 
 
 def sample_numbers(times: Array, scenario: Scenario) -> NDArray[np.intp]:
-    """Numbers of the samples at some times in s, (K,)."""
-    return np.rint(times / scenario.sampling_time).astype(np.intp)
+    """Numbers of the samples at some times.
+
+    Args:
+        times: in s, (K,).
+        scenario: has the sampling time.
+
+    Returns:
+        (K,).
+    """
+    # k·h as it is recorded is off by rounding.
+    numbers = np.rint(times / scenario.sampling_time)
+    return numbers.astype(np.intp)

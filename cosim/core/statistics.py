@@ -252,11 +252,12 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
     # Entry i has the interval [i, i+1] of ranks; its weight is what of that is in the middle half.
     ranks = np.arange(count + 1)
     edges = np.clip(ranks, 0.25 * count, 0.75 * count)
-    weight = np.diff(edges)
+    weights = np.diff(edges)
     # Values outside may be infinite.
-    inside = np.where(weight > 0, ordered, 0.0)
-    total = (inside * weight).sum(axis=-1)
-    return total / weight.sum()
+    inside = np.where(weights > 0, ordered, 0.0)
+    weighted = inside * weights
+    total = weighted.sum(axis=-1)
+    return total / weights.sum()
 
 
 def over_runs(strata: Sequence[Array]) -> Estimate:

@@ -446,7 +446,15 @@ def _start_vector(
 
 
 def start_value(fmu: UnpackedFmu, name: str) -> float:
-    """Start value of a variable or an array's element; 0 where the FMU states none."""
+    """Start value of a variable or an array's element.
+
+    Args:
+        fmu: states it.
+        name: of the variable, or of the element, ``NAME[i,j]``.
+
+    Returns:
+        The value; 0 where the FMU states none.
+    """
     variable = fmu.variable(name)
     if variable is None:
         return 0.0

@@ -98,24 +98,25 @@ class UnpackedFmu:
         an integer's type. A bound `NO_BOUND` times as large as the variable's scale is none.
         """
         variable = self.variable(name)
-        declared = getattr(variable, "declaredType", None)
-        start = number(getattr(variable, "start", None), 0.0)
-        nominal = number(getattr(variable, "nominal", None), 0.0)
+        if variable is None:
+            return -inf, inf
+        start = number(variable.start, 0.0)
+        nominal = number(variable.nominal, 0.0)
         scale = max(1.0, abs(start), abs(nominal))
-        is_integer = variable is not None and variable.type not in _REALS
-
-        def limit(field: str, unbounded: float) -> float:
-            stated = getattr(variable, field, None)
+        is_integer = variable.type not in _REALS
+        limits = []
+        for field, unbounded in (("min", -inf), ("max", inf)):
+            stated = getattr(variable, field)
             # The variable's own bound goes before its type's.
             if stated is None:
-                stated = getattr(declared, field, None)
+                stated = getattr(variable.declaredType, field, None)
             value = number(stated, unbounded)
             is_end = is_integer and value in _ENDS
             if is_end or not abs(value) < NO_BOUND * scale:
-                return unbounded
-            return value
-
-        return limit("min", -inf), limit("max", inf)
+                value = unbounded
+            limits.append(value)
+        low, high = limits
+        return low, high
 
 
 NO_BOUND = 1e15
@@ -1307,7 +1308,15 @@ class Fmi3Instance(Instance):
         self._check_end(time + 0.5 * self._step_size.value)
 
     def take_step(self, time: float, size: float) -> list[float]:
-        """Step as in FMI 2.0; an FMU that ends the step early is an error."""
+        """Step as in FMI 2.0; an FMU that ends the step early is an error.
+
+        Args:
+            time: from which, in s.
+            size: how far, in s.
+
+        Returns:
+            The states after it.
+        """
         self._raised = None
         states = super().take_step(time, size)
         self._check_end(time + 0.5 * size)

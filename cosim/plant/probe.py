@@ -443,7 +443,12 @@ HARDLY = 0.05
 
 
 def as_asked(asked: float, value: float) -> bool:
-    """Whether an FMU has the number that it was given, within rounding of a float of 32 bits."""
+    """Whether an FMU has the number that it was given, within rounding of a float of 32 bits.
+
+    Args:
+        asked: what it was given.
+        value: what it has.
+    """
     scale = max(abs(asked), abs(value))
     return abs(asked - value) <= 1e-6 * scale
 

@@ -115,6 +115,7 @@ class ClosedLoop:
                 "exact state: put an estimator before it, "
                 "controllers.OutputFeedback.from_scenario(scenario, controller)"
             )
+        # As in `step`: whoever is given the state may keep it.
         s.flags.writeable = False
         self.s = s
         self.y = y
@@ -213,6 +214,7 @@ class ClosedLoop:
         step = self._step(a)
         plant_time = perf_counter() - begin
         estimate = None
+        # Of an exact state nothing has to be estimated.
         if self.y is not None:
             estimate = getattr(self._controller, "estimate", None)
         sample = Sample(

@@ -155,7 +155,9 @@ def child_process(
     """
     environment = dict(os.environ if env is None else env)
     if folder is not None:
-        environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
+        # Whichever of them the command's platform reads.
+        for variable in ("TMPDIR", "TEMP", "TMP"):
+            environment[variable] = str(folder)
     child = subprocess.Popen(
         command,
         cwd=folder,
@@ -178,11 +180,13 @@ def _end(child: subprocess.Popen[bytes]) -> None:
     with suppress(psutil.NoSuchProcess):
         parent = psutil.Process(child.pid)
         family = [parent, *parent.children(recursive=True)]
+        # A request first: a process may have files of its own to remove.
         for end in (psutil.Process.terminate, psutil.Process.kill):
             for process in family:
                 with suppress(psutil.Error):
                     end(process)
-            family = psutil.wait_procs(family, 2.0)[1]
+            _, family = psutil.wait_procs(family, 2.0)
+    # Reaped here, so that no zombie stays.
     child.wait()
 
 
@@ -263,7 +267,9 @@ def redirected_output() -> Iterator[int | None]:
     if not is_ours:
         yield None
         return
+    # What was printed before belongs where it was going.
     sys.stdout.flush()
+    # By descriptor: native code does not know Python's `sys.stdout`.
     descriptor = os.dup(1)
     os.dup2(2, 1)
     try:

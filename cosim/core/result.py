@@ -59,7 +59,9 @@ class Shown:
         return {}
 
     def __repr__(self) -> str:
-        facts = [f"{key}={short(value)}" for key, value in self._facts().items()]
+        facts = []
+        for key, value in self._facts().items():
+            facts.append(f"{key}={short(value)}")
         return f"{type(self).__name__}({', '.join(facts)})"
 
     def _repr_html_(self) -> str:
@@ -67,9 +69,12 @@ class Shown:
 
         rows = ""
         for key, value in self._facts().items():
+            # A user's name may hold what HTML takes for a tag.
+            label = escape(key)
+            text = escape(short(value))
             rows += (
-                f'<tr><th style="text-align:left">{escape(key)}</th>'
-                f'<td style="text-align:left">{escape(short(value))}</td></tr>'
+                f'<tr><th style="text-align:left">{label}</th>'
+                f'<td style="text-align:left">{text}</td></tr>'
             )
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
@@ -84,13 +89,19 @@ class Result(Shown):
     def _repr_html_(self) -> str:
         buffer = io.BytesIO()
         self.figure().savefig(buffer, format="png", dpi=100)
-        source = f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
-        return f'{super()._repr_html_()}<img alt="" style="max-width:100%" src="{source}">'
+        # The picture is part of the page, which then needs no other file.
+        encoded = base64.b64encode(buffer.getvalue()).decode()
+        source = f"data:image/png;base64,{encoded}"
+        table = super()._repr_html_()
+        return f'{table}<img alt="" style="max-width:100%" src="{source}">'
 
     def table(self) -> str:
         """The facts as a Markdown table."""
-        rows = [(key, short(value)) for key, value in self._facts().items()]
-        return markdown_table((type(self).__name__, "value"), rows)
+        rows = []
+        for key, value in self._facts().items():
+            rows.append((key, short(value)))
+        header = (type(self).__name__, "value")
+        return markdown_table(header, rows)
 
     def plot(self, path: str | Path) -> Path:
         """Draw `figure` to a PNG or SVG file; raises FigureError on another suffix."""

@@ -112,6 +112,7 @@ def with_training_options(
         parameters = list(written.parameters.values())
         assert parameters[-1].kind is Parameter.VAR_KEYWORD
         parameters[-1:] = options
+        # `inspect.signature` takes this for the signature, and so do all who call it.
         function.__dict__["__signature__"] = written.replace(parameters=parameters)
         return function
 

@@ -51,8 +51,12 @@ def validated(
         return model.model_validate(document)
     except ValidationError as cause:
         first, *others = cause.errors(include_url=False)
-        more = f" ({len(others)} more problem{'s' * (len(others) > 1)})" if others else ""
-        raise error(f"{origin}: {_complaint(dict(first), model)}{more}") from None
+        complaint = _complaint(dict(first), model)
+        # One line: who has mended the first sees the next.
+        if others:
+            noun = "problem" if len(others) == 1 else "problems"
+            complaint += f" ({len(others)} more {noun})"
+        raise error(f"{origin}: {complaint}") from None
 
 
 def whole_number(
@@ -75,7 +79,10 @@ def whole_number(
     try:
         number = index(value)
     except TypeError:
-        raise error(f"{name} must be a whole number, not {f'{value!r}'[:60]}") from None
+        # An array's text may be pages.
+        shown = repr(value)[:60]
+        raise error(f"{name} must be a whole number, not {shown}") from None
+    # To Python a truth is a whole number.
     if isinstance(value, bool) or number < least:
         raise error(f"{name} must be at least {least}, not {value}")
     return number
@@ -89,7 +96,9 @@ def suggestion(word: str, known: Iterable[str]) -> str:
         known: words that are allowed.
     """
     close = get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f" (did you mean '{close[0]}'?)" if close else ""
+    if not close:
+        return ""
+    return f" (did you mean '{close[0]}'?)"
 
 
 def instead(word: str, known: Iterable[str]) -> str:

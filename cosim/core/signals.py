@@ -97,12 +97,12 @@ class Signals:
             return
         scenario = self._scenario
         # The last samples' previews reach beyond the end of the run.
-        longest = max(_ahead(table, scenario) for table in self.measured)
+        longest = max(ahead_of(table, scenario) for table in self.measured)
         action = scenario.reference_action
         realised = _realised(plant, seed, action, samples + longest)
         for number, table in enumerate(self.measured):
             values = realised[:, self._disturbance_index(table)]
-            ahead = _ahead(table, scenario)
+            ahead = ahead_of(table, scenario)
             # Row k has the values of the samples k … k+ahead; the view's rows share memory.
             windows = np.lib.stride_tricks.sliding_window_view(values, ahead + 1)
             known = windows[:samples].copy()
@@ -116,18 +116,20 @@ class Signals:
         """Place of the disturbance that a signal measures, in the plant's order."""
         return self._scenario.plant.disturbances.index(str(table.measures))
 
-    def check_foreseen(self, disturbances: Array) -> None:
+    def check_foreseen(self, disturbances: Array, first: int = 0) -> None:
         """Check that a run realised what was foreseen.
 
         Args:
             disturbances: of the run, (K, p).
+            first: number of the first of these samples.
 
         Raises:
             PlantError: a measured disturbance depends on the actions.
         """
         for table in self.measured:
             realised = disturbances[:, self._disturbance_index(table)]
-            foreseen = self._forecasts[table.name][: len(disturbances), 0]
+            end = first + len(disturbances)
+            foreseen = self._forecasts[table.name][first:end, 0]
             # To the bit: it is the same FMU with the same seed.
             if not np.array_equal(foreseen, realised):
                 raise PlantError(
@@ -142,7 +144,7 @@ class Signals:
 
     def ahead(self, i: int) -> int:
         """Samples beyond the present one of which signal i is known."""
-        return _ahead(self.tables[i], self._scenario)
+        return ahead_of(self.tables[i], self._scenario)
 
     def value(self, i: int, k: int) -> float:
         """Value of a signal at a sample.
@@ -322,8 +324,13 @@ def _forecast_draws(seed: int, number: int, shape: tuple[int, int]) -> Array:
     return np.random.Generator(philox).standard_normal(shape)
 
 
-def _ahead(table: SignalTable, scenario: Scenario) -> int:
-    """Samples beyond the present one of which a signal is known."""
+def ahead_of(table: SignalTable, scenario: Scenario) -> int:
+    """Samples beyond the present one of which a signal is known.
+
+    Args:
+        table: of the signal.
+        scenario: has the horizon, where the table says nothing.
+    """
     if table.known != "preview":
         return 0
     return table.ahead or scenario.controller.horizon

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from controllers import Parameters, RtiNmpc
+from controllers import Parameters, Problem, RtiNmpc
 from controllers.export import STATUSES, core, plain_c
 from controllers.theta import ThetaBlocks
 from cosim.core.errors import ControllerLookupError
@@ -96,12 +96,12 @@ def sampled_controller(
     parameters = controller.parameters
     exported = core(problem, parameters, hessian)
     # The order is that of the C's arrays: inputs, outputs, predictions, θ.
-    signals = [
-        *_input_signals(controller, scenario, measured),
-        *_output_signals(scenario),
-        *_prediction_signals(scenario, problem.horizon),
-        *_theta_signals(parameters),
-    ]
+    signals = _state_signals(scenario, problem)
+    signals += _manual_signals(scenario, problem)
+    signals += _disturbance_signals(scenario, parameters, measured)
+    signals += _output_signals(scenario)
+    signals += _prediction_signals(scenario, problem.horizon)
+    signals += _theta_signals(parameters)
     # Another controller has another name in C, so that both may be linked into one program.
     origin = f"{scenario.hash} {hessian} {parameters.hash}"
     digest = hashlib.sha256(origin.encode()).hexdigest()
@@ -120,14 +120,8 @@ def sampled_controller(
     )
 
 
-def _input_signals(
-    controller: RtiNmpc,
-    scenario: Scenario,
-    measured: tuple[str, ...],
-) -> list[Variable]:
-    """Inputs of the exported controller; not connected they are at its operating point."""
-    problem = controller.problem
-    theta = _values_by_label(controller.parameters)
+def _state_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
+    """The measured states, inputs of the controller."""
     plant = unpack(scenario.plant.fmu)
     signals = []
     # Before anything is connected the controller sees its reference.
@@ -140,6 +134,12 @@ def _input_signals(
             description="measured state",
         )
         signals.append(state)
+    return signals
+
+
+def _manual_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
+    """What takes the controller's place: a switch, and an action of each kind."""
+    plant = unpack(scenario.plant.fmu)
     # Off where a tool connects nothing to it.
     manual = Variable(
         "manual",
@@ -150,7 +150,7 @@ def _input_signals(
         max=1.0,
         description="whether the actions are those of manual_…, as of the next sample",
     )
-    signals.append(manual)
+    signals = [manual]
     for name, value in zip(scenario.plant.actions, problem.reference_action.tolist(), strict=True):
         action = Variable(
             f"manual_{name}",
@@ -160,6 +160,18 @@ def _input_signals(
             description="action in manual; acts within the bounds of the action",
         )
         signals.append(action)
+    return signals
+
+
+def _disturbance_signals(
+    scenario: Scenario,
+    parameters: Parameters,
+    measured: tuple[str, ...],
+) -> list[Variable]:
+    """The measured disturbances, inputs of the controller that start at their values in θ."""
+    plant = unpack(scenario.plant.fmu)
+    theta = _values_by_label(parameters)
+    signals = []
     for name in measured:
         disturbance = Variable(
             name,

@@ -16,7 +16,8 @@ from cosim.core.protocols import Array
 from cosim.core.result import TextTable
 from cosim.core.statistics import shown
 from cosim.core.validation import instead
-from cosim.studies.measurements import StudyMeasurements, columns_of
+from cosim.studies.case_runs import columns_of
+from cosim.studies.measurements import StudyMeasurements
 from cosim.studies.operation_tables import operation_tables
 
 TitledRows = tuple[Sequence[str], list[list[str]]]
@@ -98,7 +99,8 @@ def _printed_intervals(study: StudyMeasurements, summary: Mapping[str, Any]) -> 
     case = summary["case"]
     scenario = summary["scenario"]
     # Of one training the interval is over the noise alone.
-    kind = "regret_median" if study.is_trained_once(case, scenario) else "regret_wide"
+    trained_once = study.case_runs[scenario, case].is_trained_once
+    kind = "regret_median" if trained_once else "regret_wide"
     runs = study.runs_of(case, scenario)
     worst = runs.iloc[int(np.argmax(runs.J))]
     return {

@@ -20,13 +20,16 @@ import pandas as pd
 
 from cosim.core.result import markdown_table
 from cosim.core.statistics import mean, shown
-from cosim.studies.plan import Plan, Study, plan
+from cosim.studies.definition import Study
+from cosim.studies.plan import StudyPlan, plan
 from cosim.studies.results import StudyResults
 
 LEFT_OUT = ("B_lambda", "b_lambda", "c_lambda")
 
 
-def moves(planned: Plan, out: Path, case: str) -> tuple[dict[tuple[str, int], pd.DataFrame], dict]:
+def moves(
+    planned: StudyPlan, out: Path, case: str
+) -> tuple[dict[tuple[str, int], pd.DataFrame], dict]:
     """First and last θ of each run by scenario and training seed, and the scale of each entry."""
     found, scale = {}, {}
     for run in planned.runs:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
     from cosim.plant import FmuPlant as FmuPlant
-    from cosim.studies.plan import Study as Study
+    from cosim.studies.definition import Study as Study
     from cosim.studies.results import StudyResults as StudyResults
     from cosim.studies.results import study as study
     from cosim.training import Parameters as Parameters
@@ -35,7 +35,7 @@ _attribute, _names, __all__ = lazy_loader.attach(
         "core.protocols": ["Decision"],
         "core.scenario": ["Scenario"],
         "core.simulation": ["simulate"],
-        "studies.plan": ["Study"],
+        "studies.definition": ["Study"],
         "studies.results": ["StudyResults", "study"],
         "training": ["Parameters", "Training", "train"],
         "core.trajectory": ["Trajectory"],

@@ -17,9 +17,9 @@ from cosim.core.protocols import Array
 from cosim.core.statistics import Estimate, over_runs, two_way
 from cosim.evaluation import TIMING
 from cosim.studies.case_runs import AGGREGATED_MEANS, CaseRuns, columns_of
+from cosim.studies.definition import BASELINES
 from cosim.studies.operation_result import OperationResult, operation_result
 from cosim.studies.operation_tables import WEEK, OperationLayout
-from cosim.studies.plan import BASELINES
 from cosim.studies.ranks import shared_ranks
 from cosim.studies.run import GREEDY, INDICATORS, read_table
 from cosim.studies.tables import (
@@ -35,20 +35,53 @@ from cosim.studies.tables import (
 )
 
 RUN_COLUMNS = [
-    *RUN_STATE, "J", "regret", "regret_low", "regret_high", "gap_closed", *AGGREGATED_MEANS,
+    *RUN_STATE,
+    "J",
+    "regret",
+    "regret_low",
+    "regret_high",
+    "gap_closed",
+    *AGGREGATED_MEANS,
     "failures",
-]  # fmt: skip
+]
 SUMMARY_COLUMNS = [
-    *WHERE, "samples", "plant_samples", "finished", "runs", "regret_median",
-    "regret_median_low", "regret_median_high", "regret_worst", "regret_iqm", "regret_iqm_low",
-    "regret_iqm_high", "J_median", "J_worst", "J_iqm", "gap_closed_median", *AGGREGATED_MEANS,
-    "failures", "regret_wide_low", "regret_wide_high", "rank", "against", "difference",
-    "difference_low", "difference_high", "difference_p",
-]  # fmt: skip
-AGGREGATE_COLUMNS = [
-    "case", "scenarios", "runs", "regret_median", "regret_worst", "regret_iqm", "regret_iqm_low",
+    *WHERE,
+    "samples",
+    "plant_samples",
+    "finished",
+    "runs",
+    "regret_median",
+    "regret_median_low",
+    "regret_median_high",
+    "regret_worst",
+    "regret_iqm",
+    "regret_iqm_low",
     "regret_iqm_high",
-]  # fmt: skip
+    "J_median",
+    "J_worst",
+    "J_iqm",
+    "gap_closed_median",
+    *AGGREGATED_MEANS,
+    "failures",
+    "regret_wide_low",
+    "regret_wide_high",
+    "rank",
+    "against",
+    "difference",
+    "difference_low",
+    "difference_high",
+    "difference_p",
+]
+AGGREGATE_COLUMNS = [
+    "case",
+    "scenarios",
+    "runs",
+    "regret_median",
+    "regret_worst",
+    "regret_iqm",
+    "regret_iqm_low",
+    "regret_iqm_high",
+]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -150,7 +183,8 @@ class StudyMeasurements:
         if measured is None:
             return None
         # Both are controllers, of which there is one run.
-        return measured["J"][0]
+        cost: Array = measured["J"][0]
+        return cost
 
     def runs_of(self, case: str, scenario: str) -> pd.DataFrame:
         """The case's rows of `runs` on a scenario, by training seed."""

@@ -39,8 +39,15 @@ PART_MEMORIES = 10
 SHIFT_LEVEL = 0.05
 """Level of the test, of all shifts of a run together."""
 OPERATION_METRICS = [
-    "J", "violating", "dearest", "first_change", "updates", "model_samples", "dearer", "excess",
-]  # fmt: skip
+    "J",
+    "violating",
+    "dearest",
+    "first_change",
+    "updates",
+    "model_samples",
+    "dearer",
+    "excess",
+]
 """Columns of operation.csv."""
 
 

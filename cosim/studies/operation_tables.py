@@ -86,9 +86,16 @@ def operation_tables(
     end = result.runs[result.runs.samples == marks[-1]]
     title = f"What {times[-1]} of operation took on `{scenario}`, medians"
     header = (
-        "case", "runs", "first change, samples", "violating % since", "violations a week [95 %]",
-        "dearest 100 samples %", "updates", "model samples", "processor s",
-    )  # fmt: skip
+        "case",
+        "runs",
+        "first change, samples",
+        "violating % since",
+        "violations a week [95 %]",
+        "dearest 100 samples %",
+        "updates",
+        "model samples",
+        "processor s",
+    )
     yield title, header, _effort_rows(end, seconds, WEEK / layout.sampling_time)
 
     # Where θ never moves there is no shift to compare.

@@ -226,9 +226,16 @@ def paper_table(study: StudyMeasurements) -> TextTable:
         "Gains over the baselines: the paper's text states about 21 % over (a) and 15 % over (b)"
     )
     header = (
-        "scenario", "case", "J(b)/J(a)", "J, median", "gain over (a) %", "gain over (b) %",
-        "economic over (a) %", "economic over (b) %", "agrees with the paper on",
-    )  # fmt: skip
+        "scenario",
+        "case",
+        "J(b)/J(a)",
+        "J, median",
+        "gain over (a) %",
+        "gain over (b) %",
+        "economic over (a) %",
+        "economic over (b) %",
+        "agrees with the paper on",
+    )
     return title, header, rows
 
 

@@ -21,10 +21,11 @@ from cosim.core.simulation import reporting
 from cosim.core.validation import instead
 from cosim.evaluation import TIMING, Progress
 from cosim.figures.style import FORMATS, save_set
+from cosim.studies.definition import Study
 from cosim.studies.figures import STUDY_FIGURES
 from cosim.studies.kept import draw_kept, keep_files
 from cosim.studies.measurements import StudyMeasurements
-from cosim.studies.plan import Study, StudyPlan, plan
+from cosim.studies.plan import StudyPlan, plan
 from cosim.studies.report import FOLDER, write_report
 from cosim.studies.report_tables import (
     SHORT_COLUMNS,

@@ -20,10 +20,11 @@ from cosim.core.protocols import Array
 from cosim.core.scenario import Table
 from cosim.core.validation import instead, validated
 from cosim.evaluation import EVALUATION, TIMING
+from cosim.studies.definition import Study
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
 from cosim.studies.kept import draw_kept
-from cosim.studies.plan import LOGS, THETA, TRAJECTORIES, Study, plan
+from cosim.studies.plan import LOGS, THETA, TRAJECTORIES, plan
 from cosim.studies.report import FOLDER, rendered
 from cosim.studies.results import StudyResults
 from cosim.studies.run import GREEDY, RUNS_FOLDER, frame_csv

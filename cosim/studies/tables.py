@@ -13,8 +13,9 @@ import pandas as pd
 
 from cosim.core.training_options import LOG
 from cosim.evaluation import EVALUATION, NAIVE, TIMING
+from cosim.studies.definition import Case, Study
 from cosim.studies.operation import OPERATION_METRICS
-from cosim.studies.plan import Case, Study, StudyPlan
+from cosim.studies.plan import StudyPlan
 from cosim.studies.run import GREEDY, INDICATORS, RunStore, read_table, typed
 
 ABOUT = "study.json"

@@ -73,8 +73,10 @@ def _draw_costs(
         if optimal is None:
             rows.append(_dots(name, values, mean_of(values)))
         else:
+            # The seeds' terms, not their own regrets: a mean of these is not the regret.
             in_percent = 100 * regret_terms(values, optimal)
-            rows.append(_dots(name, in_percent, regret(values, optimal), scale=100.0))
+            estimate = regret(values, optimal)
+            rows.append(_dots(name, in_percent, estimate, scale=100.0))
     values = dot_rows(axes, rows, styles)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
@@ -83,6 +85,7 @@ def _draw_costs(
         return
     least = float(values.min())
     most = float(values.max())
+    # A plant that earns money has costs below zero, of which there is no logarithm.
     if least > 0 and most > DECADE * least:
         axes.set_xscale("log")
     axes.set_xlabel("J per sample, 95 % interval")
@@ -162,6 +165,7 @@ def _pareto_front(points: set[tuple[float, float]]) -> list[tuple[float, float]]
     front = []
     for point in sorted(points):
         others = points - {point}
+        # Points are a set: no other one is equal in both.
         is_beaten = any(np.less_equal(other, point).all() for other in others)
         if not is_beaten:
             front.append(point)

@@ -53,15 +53,29 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
             counts, _ = np.histogram(values, edges)
             density = counts / (len(values) * width)
             violates = bound - values > VIOLATING
-            label = f"{shown_case(case)}: {100 * np.mean(violates):.1f} % below"
+            percent = 100 * np.mean(violates)
+            label = f"{shown_case(case)}: {percent:.1f} % below"
+            # The area is faint, so that lines of several controllers can be seen through it.
             axes.stairs(density, edges, fill=True, alpha=0.12, color=color)
             axes.stairs(density, edges, color=color, linewidth=1.2, label=label)
-        axes.axvline(bound, color=BOUND, linewidth=1.1, linestyle=DASHED, label="bound")
+        axes.axvline(
+            bound,
+            color=BOUND,
+            linewidth=1.1,
+            linestyle=DASHED,
+            label="bound",
+        )
         axes.set_xlim(edges[0], edges[-1])
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel(style.label(state, unit))
         axes.set_ylabel(_density_label(unit))
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.2)
+        # Above the axes: within, it would hide a line.
+        axes.legend(
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=2,
+            borderaxespad=0.2,
+        )
     return drawn
 
 
@@ -91,15 +105,17 @@ def _common_bins(samples: Sequence[Array], bound: float) -> tuple[Array, float]:
     for values in samples:
         lower_quartile, upper_quartile = np.quantile(values, (0.25, 0.75))
         quartile_range = float(upper_quartile - lower_quartile)
-        fillable = float(2 * quartile_range / np.cbrt(len(values)))
+        n_samples = len(values)
+        fillable = float(2 * quartile_range / np.cbrt(n_samples))
         width = max(width, fillable)
     # All samples may be one number.
     if not width:
         width = 1e-3 * max(abs(bound), 1.0)
     # Edges are whole widths from the bound, one bin more than needed on either side.
-    first = -np.ceil((bound - low) / width) - 1
-    last = np.ceil((high - bound) / width) + 1
-    edges: Array = bound + width * np.arange(first, last + 1)
+    below = np.ceil((bound - low) / width) + 1
+    above = np.ceil((high - bound) / width) + 1
+    numbers = np.arange(-below, above + 1)
+    edges: Array = bound + width * numbers
     return edges, width
 
 
@@ -130,12 +146,24 @@ def phase_figure(
     arrow_scale = longest or 1.0
     left, right = _limits_of_cells(x)
     bottom, top = _limits_of_cells(y)
+    # Four panels make a square, not a row of three and one alone.
     columns = 2 if len(runs) == 4 else min(len(runs), 3)
     rows = -(-len(runs) // columns)
     height = 7.0 / columns * rows + 0.4
+    # One panel across the page would be as high as a page.
     width = style.WIDTH if columns > 1 else 4.2
+    first_state, second_state = scenario.plant.states[:2]
+    across = style.label(first_state, _unit(runs, first_state))
+    upright = style.label(second_state, _unit(runs, second_state))
     with style.figure(height, width) as drawn:
-        grid = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        grid = drawn.subplots(
+            rows,
+            columns,
+            sharex=True,
+            sharey=True,
+            squeeze=False,
+        )
+        # The last row may have fewer panels.
         for axes in grid.flat[len(runs) :]:
             axes.set_visible(False)
         for axes, (case, run) in zip(grid.flat, runs.items(), strict=False):
@@ -146,11 +174,10 @@ def phase_figure(
             axes.set_title(shown_case(case))
             axes.set_xlim(left, right)
             axes.set_ylim(bottom, top)
-        first_state, second_state = scenario.plant.states[:2]
         for axes in grid[-1]:
-            axes.set_xlabel(style.label(first_state, _unit(runs, first_state)))
+            axes.set_xlabel(across)
         for axes in grid[:, 0]:
-            axes.set_ylabel(style.label(second_state, _unit(runs, second_state)))
+            axes.set_ylabel(upright)
         drawn.supxlabel(_caption(scenario, longest), fontsize=7.0)
     return drawn
 
@@ -166,8 +193,10 @@ def _grid_of_states(runs: Sequence[Trajectory]) -> tuple[Array, Array]:
 
 def _limits_of_cells(points: Array) -> tuple[float, float]:
     """Limits of an axis that reaches half a cell beyond the outermost points, where arrows end."""
+    first = float(points[0])
+    last = float(points[-1])
     half = 0.5 * float(points[1] - points[0])
-    return float(points[0]) - half, float(points[-1]) + half
+    return first - half, last + half
 
 
 def _caption(scenario: Scenario, longest: float) -> str:
@@ -195,10 +224,12 @@ def _field(policy: Policy, x: Array, y: Array, scenario: Scenario) -> Array:
         The field, (Y, X, 2).
     """
     actions = np.empty((len(y), len(x), 2))
+    # State by state: a policy is a controller, and takes no batch.
     for row, second in enumerate(y):
         for column, first in enumerate(x):
             state = np.array([first, second])
-            actions[row, column] = policy(state)[:2]
+            action = policy(state)
+            actions[row, column] = action[:2]
     from_operating_point = actions - scenario.reference_action[:2]
     # Inputs of unlike units become comparable as shares of their range.
     input_range = scenario.action_upper - scenario.action_lower
@@ -213,7 +244,11 @@ def _lengths(field: Array) -> Array:
 
 def _longest_arrow(fields: Sequence[Array]) -> float:
     """Largest length in fields (Y, X, 2); an action that is NaN has none."""
-    return max(float(np.nanmax(_lengths(field))) for field in fields)
+    longest = 0.0
+    for field in fields:
+        lengths = _lengths(field)
+        longest = max(longest, float(np.nanmax(lengths)))
+    return longest
 
 
 def _draw_density(axes: Axes, states: Array, extent: tuple[float, float, float, float]) -> None:
@@ -221,7 +256,10 @@ def _draw_density(axes: Axes, states: Array, extent: tuple[float, float, float, 
     left, right, bottom, top = extent
     x = states[:, 0]
     y = states[:, 1]
-    inside = (x > left) & (x < right) & (y > bottom) & (y < top)
+    # The axes leave out the outermost samples.
+    inside_x = (x > left) & (x < right)
+    inside_y = (y > bottom) & (y < top)
+    inside = inside_x & inside_y
     cells = axes.hexbin(
         x[inside],
         y[inside],
@@ -240,12 +278,17 @@ def _draw_density(axes: Axes, states: Array, extent: tuple[float, float, float, 
 def _draw_arrows(axes: Axes, x: Array, y: Array, field: Array) -> None:
     """Draw a field (Y, X, 2) on a grid as arrows, whose length goes with the root of its size."""
     size = _lengths(field)
+    # An arrow without a length has no direction, and is not drawn.
+    divisible = np.where(size > 0, size, 1.0)
     # Divided by the root of its size: else small arrows could not be seen beside large ones.
-    shrink = 1.0 / np.sqrt(np.where(size > 0, size, 1.0))
+    shrink = 1.0 / np.sqrt(divisible)
+    grid_x, grid_y = np.meshgrid(x, y)
     axes.quiver(
-        *np.meshgrid(x, y),
+        grid_x,
+        grid_y,
         field[..., 0] * shrink,
         field[..., 1] * shrink,
+        # Directions are those of the inputs, not of points in the plane of the states.
         angles="uv",
         pivot="mid",
         scale=1.05 * max(len(x), len(y)),

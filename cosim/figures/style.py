@@ -31,7 +31,9 @@ FORMATS = ("svg", "png")
 FLOOR = 0.01
 """Regret in % below which an axis is linear."""
 
-ENTRIES = tuple(map(to_hex, mpl.colormaps["viridis"](np.linspace(0.0, 0.88, 6))))
+# The end of the map is too bright for a line on white.
+_SHARES = np.linspace(0.0, 0.88, 6)
+ENTRIES = tuple(to_hex(color) for color in mpl.colormaps["viridis"](_SHARES))
 """Colours of θ's blocks and entries, none of which is a controller's."""
 BOUND = "#B2182B"
 REFERENCE = "#5A6570"
@@ -59,8 +61,16 @@ _KNOWN = {
 }
 """Colours of the rules and controllers that every figure knows."""
 _OTHERS = ("#CC6677", "#A6761D", "#E377C2", "#6D9E1F", "#B04FD0", "#4477AA", "#DDCC77")
-_DASHES: Any = ((4, 1.5), (1, 1.2), (5, 1.5, 1, 1.5), (9, 2), (1, 3), (4, 1, 1, 1, 1, 1))
-_LINES: Any = ["-", *((0, dashes) for dashes in _DASHES)]
+# Lengths of strokes and gaps in turn, as matplotlib takes them: offset and pattern.
+_LINES: Any = [
+    "-",
+    (0, (4, 1.5)),
+    (0, (1, 1.2)),
+    (0, (5, 1.5, 1, 1.5)),
+    (0, (9, 2)),
+    (0, (1, 3)),
+    (0, (4, 1, 1, 1, 1, 1)),
+]
 _STYLE = Path(__file__).with_name("house.mplstyle")
 
 
@@ -106,8 +116,10 @@ def save(drawn: Figure, path: str | Path) -> Path:
     # Not the user's backend, which may need a screen.
     FigureCanvasAgg(drawn)
     with mpl.rc_context(fname=_STYLE):
-        # The SVG writer adds the date unless told not to.
-        metadata = {"Date": None} if kind == "svg" else {"Software": "rti-cosim"}
+        metadata: dict[str, str | None] = {"Software": "rti-cosim"}
+        if kind == "svg":
+            # The SVG writer adds the date unless told not to, and knows no software.
+            metadata = {"Date": None}
         drawn.savefig(content, format=kind, dpi=200, metadata=metadata)
     return write_atomically(path, content.getvalue())
 
@@ -156,6 +168,7 @@ def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Li
     """
     endings = [f"-{scenario}" for scenario in scenarios]
     rules = {name: _rule(name, endings) for name in names}
+    # Rules that are not known have the other colours, in the order in which they come.
     other_colors = cycle(_OTHERS)
     colors: dict[str, str] = {}
     for rule in rules.values():
@@ -167,8 +180,9 @@ def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Li
     styles = {}
     for name, rule in rules.items():
         color = colors[rule]
-        line = _LINES[n_lines[color] % len(_LINES)]
-        styles[name] = LineStyle(color, line)
+        # Counted by colour, not by rule: two rules may have one colour.
+        number = n_lines[color] % len(_LINES)
+        styles[name] = LineStyle(color, _LINES[number])
         n_lines[color] += 1
     return styles
 
@@ -190,8 +204,10 @@ def lighten(color: str) -> str:
     if max(rgb) > 0.55:
         return color
     hue, lightness, saturation = rgb_to_hls(*rgb)
+    # The hue stays: it is what tells the rules apart in all figures.
     lighter = max(lightness, 0.85 - lightness)
-    return to_hex(hls_to_rgb(hue, lighter, saturation))
+    lighter_rgb = hls_to_rgb(hue, lighter, saturation)
+    return to_hex(lighter_rgb)
 
 
 def plain(text: str) -> str:
@@ -247,7 +263,12 @@ def label(name: str, unit: str) -> str:
     return f"{text} [{shown_unit}]"
 
 
-def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: float = FLOOR) -> None:
+def regret_axis(
+    axes: Axes,
+    which: Literal["x", "y"],
+    values: Array,
+    floor: float = FLOOR,
+) -> None:
     """Scale an axis for regrets: logarithmic above a floor, linear below, J* at zero.
 
     Args:
@@ -257,11 +278,18 @@ def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: floa
         floor: in %.
     """
     finite = values[np.isfinite(values)]
-    low = float(finite.min()) if finite.size else 0.0
-    high = float(finite.max()) if finite.size else floor
+    low = 0.0
+    high = floor
+    # All runs may have diverged.
+    if finite.size:
+        low = float(finite.min())
+        high = float(finite.max())
     # A margin that is a factor; on the linear part, where J* is, a share of it.
-    first = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
+    first = min(1.6 * low, -0.3 * floor)
+    if low > floor:
+        first = low / 1.6
     last = 1.6 * max(high, floor)
+    # matplotlib has no setter for an axis by its letter.
     if which == "x":
         axes.set_xscale("symlog", linthresh=floor, linscale=0.5)
         axes.set_xlim(first, last)
@@ -294,9 +322,11 @@ def dot_rows(axes: Axes, rows: Sequence[DotRow], styles: Mapping[str, LineStyle]
     Returns:
         The values of all rows, one after the other.
     """
+    names = []
     for position, row in enumerate(rows):
         _dot_row(axes, position, row, styles[row.case].color)
-    axes.set_yticks(range(len(rows)), [shown_case(row.case) for row in rows])
+        names.append(shown_case(row.case))
+    axes.set_yticks(range(len(rows)), names)
     # The first row is above.
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
@@ -307,13 +337,23 @@ def _dot_row(axes: Axes, position: int, row: DotRow, color: str) -> None:
     """Draw the row of a case at a position on the ordinate."""
     is_single = len(row.values) == 1
     # Values beside each other are drawn a little above each other.
-    offsets = np.zeros(1) if is_single else np.linspace(-0.18, 0.18, len(row.values))
-    y = position + offsets
-    look: Any = {"s": 13, "alpha": 0.55, "zorder": 3, "color": color}
+    reach = 0.0 if is_single else 0.18
+    y = position + np.linspace(-reach, reach, len(row.values))
     finished = row.finished
-    diverged = ~finished
-    axes.scatter(row.values[finished], y[finished], marker="o", linewidths=0, **look)
-    axes.scatter(row.values[diverged], y[diverged], marker="x", linewidths=0.9, **look)
+    marks = {"o": finished, "x": ~finished}
+    for marker, is_marked in marks.items():
+        axes.scatter(
+            row.values[is_marked],
+            y[is_marked],
+            s=13,
+            marker=marker,
+            # A cross is all line, and a dot has no edge.
+            linewidths=0.9 if marker == "x" else 0,
+            color=color,
+            alpha=0.55,
+            zorder=3,
+        )
+    # An interval without an end is not drawn: nothing is known of it.
     if np.isfinite([row.low, row.high]).all():
         axes.hlines(position, row.low, row.high, color=INK, linewidth=1.1, zorder=4)
     axes.vlines(
@@ -364,15 +404,22 @@ def cost_lines(
     """
     labels = []
     for name, level in levels.items():
-        labels.append(EndLabel(shown_case(name), level, REFERENCE))
+        text = shown_case(name)
+        labels.append(EndLabel(text, level, REFERENCE))
     for line in lines:
         axes.plot(line.samples, line.costs, **line.look)
-        end = float(line.costs[-1])
-        labels.append(EndLabel(shown_case(line.name), end, line.look["color"]))
+        label_of_line = EndLabel(
+            text=shown_case(line.name),
+            y=float(line.costs[-1]),
+            color=line.look["color"],
+        )
+        labels.append(label_of_line)
     for level in levels.values():
         axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
     if relative:
-        regret_axis(axes, "y", np.array(axes.dataLim.intervaly))
+        # What was drawn so far, the levels with it, is what the axis must show.
+        drawn_range = np.array(axes.dataLim.intervaly)
+        regret_axis(axes, "y", drawn_range)
     return labels
 
 
@@ -405,20 +452,21 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
         ends = np.clip(heights, 0.0, 1.0)
         highest_first = np.argsort(-ends, kind="stable")
         # A line of text, as a share of the axes' height.
-        axes_points = axes.get_window_extent().height * 72 / axes.figure.dpi
+        axes_pixels = axes.get_window_extent().height
+        axes_points = axes_pixels * 72 / axes.figure.dpi
         gap = 1.25 * END_SIZE / axes_points
         positions = spread(ends[highest_first], gap)
         for position, index in zip(positions, highest_first, strict=True):
-            _label_end(axes, names[index], float(ends[index]), float(position))
+            end = float(ends[index])
+            _label_end(axes, names[index], end, float(position))
 
 
 def _height(axes: Axes, y: float) -> float:
     """Where an ordinate lies on the page, as a share of the axes' height."""
-    to_page = axes.transData.transform
     low, high = axes.get_ylim()
-    bottom = to_page((0, low))[1]
-    top = to_page((0, high))[1]
-    here = to_page((0, y))[1]
+    # Through the page, since the ordinate may be logarithmic.
+    points = axes.transData.transform([(0, low), (0, high), (0, y)])
+    bottom, top, here = points[:, 1]
     return float((here - bottom) / (top - bottom))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import product
+from itertools import cycle, product
 from typing import Any
 
 import numpy as np
@@ -39,11 +39,18 @@ BLOCKS = 4
 """Blocks of θ that are drawn, at most: those that moved most."""
 PANEL_COLUMNS = 4
 """Panels beside each other in the paper's figure."""
-_LINE: Any = {"markersize": 3, "linewidth": 1.2, "clip_on": False}
+Panel = Callable[[Axes], Sequence[EndLabel]]
+"""Draws a panel on its axes and returns the names at its lines' ends."""
+# A marker at the edge of the axes is drawn whole.
+_LINE: Any = {
+    "markersize": 3,
+    "linewidth": 1.2,
+    "clip_on": False,
+}
 # Of the entries of a block, in turn: solid in every colour, then dashed.
-_ENTRY_LOOKS: Any = [
-    {"linestyle": line, "color": color} for line, color in product(("-", DASHED), ENTRIES)
-]
+_ENTRY_LOOKS: list[dict[str, Any]] = []
+for _line, _color in product(("-", DASHED), ENTRIES):
+    _ENTRY_LOOKS.append({"linestyle": _line, "color": _color})
 
 
 def training_figure(
@@ -65,50 +72,74 @@ def training_figure(
             shown as regret (J − J*)/|J*|.
         title: of the figure.
     """
+    panels = _training_panels(log, theta, baselines)
+    # Four panels make a square; up to three a row.
+    columns = len(panels) if len(panels) < 4 else 2
+    rows = -(-len(panels) // columns)
+    # A training may have ended before its first sample.
+    end = max(float(log["samples"][-1]), 1.0)
+    with figure(2.15 * rows + 0.35) as drawn:
+        grid = drawn.subplots(rows, columns, sharex=True, squeeze=False)
+        labels = []
+        for axes, (name, draw) in zip(grid.flat, panels.items(), strict=True):
+            labels.append((axes, draw(axes)))
+            axes.set_title(name, loc="left", fontsize=8.0)
+            samples_axis(axes, end)
+        for axes in grid[-1]:
+            axes.set_xlabel("training samples")
+        drawn.suptitle(plain(title))
+        label_ends(drawn, labels)
+    return drawn
+
+
+def _training_panels(
+    log: Mapping[str, Array],
+    theta: Mapping[str, Array],
+    baselines: Mapping[str, float],
+) -> dict[str, Panel]:
+    """What draws each panel of a training, by its title: only of what is known.
+
+    Args:
+        log: columns (K,) of the training's log.
+        theta: a block's increments, (K, entries), by its name.
+        baselines: J by controller on the greedy policy's noise.
+    """
+    panels: dict[str, Panel] = {}
     best = baselines.get("optimal")
-    share_samples, share = _known(log, "greedy_violating_share")
-    error_samples, error = _known(log, "td_error")
-    moved = _most_moved(theta)
-    draw_cost = partial(_draw_cost, log=log, baselines=baselines, best=best)
-    panels: dict[str, Callable[[Axes], Sequence[EndLabel]]] = {}
-    panels["J per sample" if best is None else "regret %"] = draw_cost
+    title_of_cost = "J per sample" if best is None else "regret %"
+    panels[title_of_cost] = partial(
+        _draw_cost,
+        log=log,
+        baselines=baselines,
+        best=best,
+    )
+    samples, share = _known(log, "greedy_violating_share")
     if share.size:
         panels["greedy: violating samples %"] = partial(
             _draw_course,
-            samples=share_samples,
+            samples=samples,
             values=100 * share,
             color=LEARNED_COLOR,
             least=1.0,
         )
+    samples, error = _known(log, "td_error")
     # A single error makes no curve.
     if error.size > 1:
         panels["TD error (r.m.s.)"] = partial(
             _draw_course,
-            samples=error_samples,
+            samples=samples,
             values=error,
             color=INK,
             least=1e-12,
         )
+    moved = _most_moved(theta)
     if moved:
         panels["change of θ, by its scale"] = partial(
             _draw_change,
             samples=log["samples"],
             moved=moved,
         )
-    columns = len(panels) if len(panels) < 4 else 2
-    rows = -(-len(panels) // columns)
-    with figure(2.15 * rows + 0.35) as drawn:
-        grid = drawn.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-        labels = []
-        for axes, (name, draw) in zip(grid, panels.items(), strict=True):
-            labels.append((axes, draw(axes)))
-            axes.set_title(name, loc="left", fontsize=8.0)
-            samples_axis(axes, max(float(log["samples"][-1]), 1.0))
-        for axes in grid[-columns:]:
-            axes.set_xlabel("training samples")
-        drawn.suptitle(plain(title))
-        label_ends(drawn, labels)
-    return drawn
+    return panels
 
 
 def _most_moved(theta: Mapping[str, Array]) -> dict[str, Array]:
@@ -118,14 +149,20 @@ def _most_moved(theta: Mapping[str, Array]) -> dict[str, Array]:
         norm = np.linalg.norm(increments, axis=1)
         if norm.any():
             norms[name] = norm
-    farthest_first = sorted(norms, key=lambda name: -float(norms[name][-1]))
+
+    def end_of(name: str) -> float:
+        return float(norms[name][-1])
+
+    # Stable, and by the negative number: blocks that moved equally far stay in θ's order.
+    farthest_first = sorted(norms, key=lambda name: -end_of(name))
     return {name: norms[name] for name in farthest_first[:BLOCKS]}
 
 
 def _known(log: Mapping[str, Array], name: str) -> tuple[Array, Array]:
     """Samples and finite values of a column; empty where the log has none."""
     samples = log["samples"]
-    values = log.get(name, np.full(len(samples), np.nan))
+    nowhere = np.full(len(samples), np.nan)
+    values = log.get(name, nowhere)
     is_known = np.isfinite(values)
     return samples[is_known], values[is_known]
 
@@ -140,7 +177,9 @@ def _draw_cost(
 
     def shown(cost: Array | float) -> Array:
         values = np.asarray(cost, dtype=np.float64)
-        return values if best is None else 100 * regrets(values, best)
+        if best is None:
+            return values
+        return 100 * regrets(values, best)
 
     lines = []
     samples, cost = _known(log, "J")
@@ -167,8 +206,9 @@ def _draw_course(
     axes.plot(samples, values, marker=marker, color=color, **_LINE)
     low = float(values.min())
     top = max(float(values.max()), least)
-    short = EngFormatter(sep="") if top >= 1e3 else FormatStrFormatter("%g")
-    axes.yaxis.set_major_formatter(short)
+    # 20k in place of 20000: a panel is narrow.
+    formatter = EngFormatter(sep="") if top >= 1e3 else FormatStrFormatter("%g")
+    axes.yaxis.set_major_formatter(formatter)
     if 0 < DECADES * low < top:
         axes.set_yscale("log")
     else:
@@ -184,7 +224,8 @@ def _draw_change(axes: Axes, samples: Array, moved: Mapping[str, Array]) -> list
     # No more blocks are drawn than there are colours.
     for color, (name, norm) in zip(ENTRIES, moved.items(), strict=False):
         axes.plot(samples, norm, color=color, linewidth=1.2)
-        labels.append(EndLabel(symbol(name), float(norm[-1]), color))
+        end = float(norm[-1])
+        labels.append(EndLabel(symbol(name), end, color))
         top = max(top, float(norm.max()))
     # Linear below 1, since every increment begins at 0.
     if top > DECADES:
@@ -194,7 +235,11 @@ def _draw_change(axes: Axes, samples: Array, moved: Mapping[str, Array]) -> list
     return labels
 
 
-def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error: Array) -> Figure:
+def parameters_figure(
+    samples: Array,
+    increments: Mapping[str, Array],
+    td_error: Array,
+) -> Figure:
     """The paper's figure of a training: increments of θ by block, and the TD error.
 
     Source: paper.tex, fig. nmpc_learn.
@@ -207,9 +252,13 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
     # A rule learns some blocks of θ only.
     moving = {name: values for name, values in increments.items() if np.any(values)}
     rows = -(-len(moving) // PANEL_COLUMNS)
+    # The TD error, across the page, is a little higher than the panels of θ.
+    heights = [1.0] * rows
+    heights.append(1.2)
     with figure(1.3 * rows + 2.2) as drawn:
-        grid = drawn.add_gridspec(rows + 1, PANEL_COLUMNS, height_ratios=[*[1.0] * rows, 1.2])
+        grid = drawn.add_gridspec(rows + 1, PANEL_COLUMNS, height_ratios=heights)
         first: Axes | None = None
+        most_entries = 0
         for i, (name, values) in enumerate(moving.items()):
             row, column = divmod(i, PANEL_COLUMNS)
             axes = drawn.add_subplot(grid[row, column], sharex=first)
@@ -218,21 +267,23 @@ def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error:
             # Samples stand below the lowest panel of each column.
             is_lowest = i + PANEL_COLUMNS >= len(moving)
             axes.tick_params(labelbottom=is_lowest)
+            most_entries = max(most_entries, values.shape[1])
         axes = drawn.add_subplot(grid[rows, :], sharex=first)
         axes.plot(samples, td_error, color=INK, linewidth=1.0)
         samples_axis(axes, float(samples[-1]), "samples")
         title = f"TD error in the stage cost's unit, r.m.s. of the preceding {TD_WINDOW} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
+        # A θ that never moved has no entries to name.
         if moving:
-            most_entries = max(values.shape[1] for values in moving.values())
             _draw_entries_legend(drawn, most_entries)
     return drawn
 
 
 def _draw_increments(axes: Axes, samples: Array, name: str, values: Array) -> None:
     """Draw the increments (K, entries) of a block of θ."""
-    for k, entry in enumerate(values.T):
-        axes.plot(samples, entry, linewidth=0.8, **_ENTRY_LOOKS[k % len(_ENTRY_LOOKS)])
+    # Of a block with more entries than looks the first looks come again.
+    for entry, look in zip(values.T, cycle(_ENTRY_LOOKS), strict=False):
+        axes.plot(samples, entry, linewidth=0.8, **look)
     axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))

@@ -58,6 +58,7 @@ def trajectory_figure(
     scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
     cost_colors = {"stage_cost": REFERENCE, "penalty": BOUND}
+    # Left the states and inputs with their bounds, right what acts on the plant, and the costs.
     left = [*scenario.limits]
     right = [*scenario.plant.disturbances, *cost_colors]
     # Panels on the right may be a little lower than those of the loop.
@@ -70,15 +71,23 @@ def trajectory_figure(
             width_ratios=(1.35, 1.0),
         )
         for name, axes in panels.items():
-            axes.set_ylabel(label(name, trajectory.signals[name].unit), fontsize=7.0)
+            signal_unit = trajectory.signals[name].unit
+            axes.set_ylabel(label(name, signal_unit), fontsize=7.0)
             for run in beside:
                 _span(axes, time[0], run[name])
         _loop_panels(panels, time, trajectory, scenario)
         for name in right:
             color = cost_colors.get(name, REFERENCE)
-            panels[name].step(time, trajectory[name], where="post", color=color, linewidth=0.6)
+            panels[name].step(
+                time,
+                trajectory[name],
+                where="post",
+                color=color,
+                linewidth=0.6,
+            )
         for name in cost_colors:
-            _draw_mean(panels[name], float(np.mean(trajectory[name])))
+            mean = float(np.mean(trajectory[name]))
+            _draw_mean(panels[name], mean)
         panels["penalty"].set_ylim(bottom=0.0)
         for names in (left, right):
             lowest = panels[names[-1]]
@@ -105,7 +114,9 @@ def _mosaic(left: Sequence[str], right: Sequence[str]) -> list[Any]:
 
 def _span(axes: Axes, time: float, values: Array) -> None:
     """Let an ordinate show values; an axis that follows its data needs points, at any time."""
-    axes.update_datalim([(time, np.min(values)), (time, np.max(values))])
+    lowest = (time, np.min(values))
+    highest = (time, np.max(values))
+    axes.update_datalim([lowest, highest])
     axes.autoscale_view()
 
 
@@ -118,6 +129,7 @@ def _loop_panels(
     """Draw states and inputs, their bounds and operating point, and fallback actions."""
     controller = trajectory.controller or "run"
     color = palette([controller])[controller].color
+    # In the order of the limits: states, then inputs.
     operating_point = np.append(scenario.reference_state, scenario.reference_action)
     failed = trajectory["failed"] > 0
     for name, reference in zip(scenario.limits, operating_point, strict=True):
@@ -125,9 +137,18 @@ def _loop_panels(
         _line(axes, time, trajectory, name, color, width=0.9, shade=BOUND)
         moving = _moving_bounds(trajectory, name)
         for values in moving.values():
-            axes.step(time, values, where="post", color=BOUND, linewidth=1.0, linestyle=DASHED)
+            axes.step(
+                time,
+                values,
+                where="post",
+                color=BOUND,
+                linewidth=1.0,
+                linestyle=DASHED,
+            )
+        # Where a bound moves, the scenario's own number would mislead.
         if not moving:
-            _limits(axes, *scenario.limits[name])
+            lower, upper = scenario.limits[name]
+            _limits(axes, lower, upper)
         axes.axhline(reference, color=REFERENCE, linewidth=0.7)
         _draw_known(axes, time, trajectory, name)
         if name in scenario.plant.actions and failed.any():
@@ -158,7 +179,15 @@ def _draw_known(axes: Axes, time: Array, trajectory: DrawnRun, name: str) -> Non
             label="estimated",
         )
     if measurement is not None:
-        axes.plot(time, measurement.values, ".", color=INK, markersize=2.5, label="measured")
+        # As dots: between two of them a sensor showed nothing new.
+        axes.plot(
+            time,
+            measurement.values,
+            ".",
+            color=INK,
+            markersize=2.5,
+            label="measured",
+        )
     # Above the panel, where no line runs.
     axes.legend(
         loc="lower left",
@@ -172,6 +201,7 @@ def _draw_known(axes: Axes, time: Array, trajectory: DrawnRun, name: str) -> Non
 def _draw_mean(axes: Axes, mean: float) -> None:
     """Draw a mean as a dotted line, and its number in the corner."""
     axes.axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
+    # `g` would write large numbers with an exponent.
     number = f"{mean:.0f}" if abs(mean) >= 1000 else f"{mean:.4g}"
     axes.annotate(
         f"mean {number}",
@@ -209,9 +239,12 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
         panels = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
         for axes, (name, bounds) in zip(panels, scenario.limits.items(), strict=True):
             for controller, run in runs.items():
+                time = run.time / scale
                 color = styles[controller].color
-                _line(axes, run.time / scale, run, name, color, width=1.1, shade=color)
-            _limits(axes, *bounds)
+                _line(axes, time, run, name, color, width=1.1, shade=color)
+            # After all lines: how far a bound is drawn depends on the data.
+            lower, upper = bounds
+            _limits(axes, lower, upper)
             axes.set_ylabel(label(name, first.signals[name].unit))
         # The last input is held for a sample more.
         end = first.time[-1] + scenario.sampling_time
@@ -265,9 +298,10 @@ def animation(
     """
     if Path(path).suffix != ".gif":
         raise FigureError(f"cannot draw '{path}': the file must end in .gif")
+    all_runs = [first, *runs.values()]
     values = {}
     for signal in first.scenario.limits:
-        values[signal] = np.concatenate([run[signal] for run in (first, *runs.values())])
+        values[signal] = np.concatenate([run[signal] for run in all_runs])
     images = []
     for title, run in runs.items():
         drawn = overlay_figure({start: first, name: run})
@@ -322,6 +356,7 @@ def episode_image(
         The image, (height, width, 3).
     """
     samples = np.arange(first, first + len(states), dtype=float)
+    # As a product: a sum of sampling times would drift.
     seconds: Array = scenario.sampling_time * samples
     scale, unit = time_unit(seconds)
     time = seconds / scale
@@ -337,7 +372,8 @@ def episode_image(
             else:
                 # An action is held from its sample to the next.
                 axes.stairs(held_values[name], time, color=INK, baseline=None)
-            _limits(axes, *bounds)
+            lower, upper = bounds
+            _limits(axes, lower, upper)
         panels[-1].set_xlabel(f"time [{unit}]")
         # After a reset there is one state, and no range.
         end = time[-1] if len(time) > 1 else time[0] + 1.0
@@ -348,6 +384,7 @@ def episode_image(
 
 def _pixels(drawn: Figure) -> NDArray[np.uint8]:
     """A figure as an RGB image, (height, width, 3)."""
+    # Without a screen, whatever backend the user has chosen.
     canvas: Any = FigureCanvasAgg(drawn)
     canvas.draw()
     rgba = np.asarray(canvas.buffer_rgba())
@@ -409,7 +446,9 @@ def _moving_bounds(run: DrawnRun, name: str) -> dict[str, Array]:
     moving = {}
     for signal in run.scenario.signals or ():
         if signal.bounded_state == name and signal.bound is not None:
-            moving[signal.bound[:3]] = run[f"signal[{signal.name}]"]
+            # A bound is written `x_l[X2]`.
+            side = signal.bound[:3]
+            moving[side] = run[f"signal[{signal.name}]"]
     return moving
 
 
@@ -417,10 +456,14 @@ def _limits(axes: Axes, lower: float, upper: float) -> None:
     """Draw a bound where it is no farther from the data than they are wide, else name it."""
     low, high = axes.dataLim.intervaly
     span = max(high - low, 1e-9)
-    bounds = {"≥": (lower, low - lower), "≤": (upper, upper - high)}
+    bounds = {
+        "≥": (lower, low - lower),
+        "≤": (upper, upper - high),
+    }
     far = []
     for sign, (bound, distance) in bounds.items():
         text = f"{sign} {bound:g}"
+        # Drawn from afar it would press the data into a line.
         if distance < span:
             _draw_bound(axes, bound, text)
         else:

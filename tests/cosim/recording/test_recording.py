@@ -21,7 +21,7 @@ from cosim.recording import (
     summarise,
 )
 from cosim.recording.read import worst_moment
-from cosim.recording.write import drawable
+from cosim.recording.stream import drawable
 from tests.helpers.blocks import random_block
 from tests.helpers.loop import Proportional
 

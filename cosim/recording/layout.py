@@ -50,7 +50,7 @@ def view(
     for entity in dict.fromkeys(entities):
         contents.append(f"/{entity}")
         contents.append(f"/bounds/{entity}/**")
-    # Without a range the viewer fits one to what it has loaded.
+    # Without a range the viewer chooses one.
     ordinate = None
     if lows:
         ordinate = rrb.ScalarAxis(range=(min(lows), max(highs)))

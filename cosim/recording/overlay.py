@@ -16,7 +16,11 @@ from cosim.recording.layout import AT, axis, tabs, view
 from cosim.recording.stream import FREE, SERIES, Channel, Stream, times
 
 
-def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str) -> None:
+def record_overlay(
+    path: str | Path,
+    runs: Mapping[str, RunSignals],
+    about: str,
+) -> None:
     """Write a recording of runs of one scenario over each other.
 
     The signals are `<run>/<signal>` for every signal that all runs have, and, of two runs,
@@ -54,12 +58,15 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
                 stream.send([line], rows, values, ends)
             # The title has the unit and the bounds, but no run's name.
             titled = replace(lines[0], name=signal)
-            overlaid.append(view(titled.title, lines, along))
+            plot = view(titled.title, lines, along)
+            overlaid.append(plot)
             # A difference of more than two runs would need one to compare with.
             if len(runs) == 2:
                 line = _send_difference(stream, first, others[0], signal)
-                differences.append(view(line.title, [line], along))
-        stream.layout = tabs({title: overlaid, "difference": differences})
+                plot = view(line.title, [line], along)
+                differences.append(plot)
+        views_of = {title: overlaid, "difference": differences}
+        stream.layout = tabs(views_of)
 
 
 def _common_signals(runs: Mapping[str, RunSignals]) -> list[str]:
@@ -114,8 +121,10 @@ def _overlaid_lines(runs: Mapping[str, RunSignals], signal: str) -> list[Channel
     styles = palette(list(runs))
     lines: list[Channel] = []
     for name, run in runs.items():
+        bounds = FREE
         # The bounds of the others would lie on those of the first.
-        bounds = FREE if lines else run.bounds.get(signal, FREE)
+        if not lines:
+            bounds = run.bounds.get(signal, FREE)
         line = Channel(
             entity=f"{escaped(name)}/{escaped(signal)}",
             name=f"{name}/{signal}",

@@ -27,6 +27,8 @@ SIGNAL = "cosim.Signal"
 """Archetype of the static mark (name, unit) on every entity that holds a signal."""
 _NAMES = f"{SIGNAL}:name"
 _UNITS = f"{SIGNAL}:unit"
+StaticTexts = dict[str, dict[str, list[str]]]
+"""Texts that hold for a whole recording, by entity and component."""
 _SCALARS = rr.Scalars.descriptor_scalars().component
 _STATE_COLUMN = rr.StateChange.descriptor_state().component
 
@@ -57,21 +59,15 @@ def read_recording(path: str | Path) -> Recording:
     Raises RecordingError where there is no such file, or it is no recording of this package.
     """
     static, rows_of = _entities(Path(path))
-    # The writer marks an entity of signals by their names; bounds and status are unmarked.
-    marked = [entity for entity, texts in static.items() if _NAMES in texts]
-    if not marked:
-        raise RecordingError(f"{path} holds no signals of rti-cosim")
+    units_of = _units_by_entity(static, path)
     signals: dict[str, NDArray[np.float64]] = {}
     intermediate: dict[str, NDArray[np.float64]] = {}
     all_units: dict[str, str] = {}
     samples = np.empty(0, np.int64)
     time = np.empty(0)
-    for entity in marked:
-        names = static[entity][_NAMES]
-        units = static[entity].get(_UNITS, [])
-        if len(names) != len(units):
-            raise RecordingError(f"{path} was recorded by another version of rti-cosim")
-        all_units.update(zip(names, units, strict=True))
+    for entity, units in units_of.items():
+        all_units |= units
+        names = list(units)
         rows = rows_of.get(entity)
         if rows is None:
             signals |= dict.fromkeys(names, np.empty(0))
@@ -89,7 +85,10 @@ def read_recording(path: str | Path) -> Recording:
         if len(rows) > len(samples):
             samples = np.asarray(rows[SAMPLE])
             time = moments
-    changes = rows_of.get(STATUS_ENTITY)
+    status: list[str] = []
+    # A training has no status.
+    if STATUS_ENTITY in rows_of:
+        status = _status(rows_of[STATUS_ENTITY], samples)
     return Recording(
         # Entities come in the order in which the file's chunks were written.
         signals=dict(sorted(signals.items())),
@@ -97,14 +96,39 @@ def read_recording(path: str | Path) -> Recording:
         time=time,
         units=all_units,
         properties=_properties(static),
-        status=[] if changes is None else _status(changes, samples),
+        status=status,
         intermediate=intermediate,
     )
 
 
-def _entities(path: Path) -> tuple[dict[str, dict[str, list[str]]], dict[str, pa.Table]]:
+def _units_by_entity(
+    static: Mapping[str, Mapping[str, list[str]]],
+    path: str | Path,
+) -> dict[str, dict[str, str]]:
+    """Units of the signals of each entity that holds any, by the signal's name.
+
+    Args:
+        static: static texts of each entity by component.
+        path: of the file, for the messages.
+    """
+    units_of = {}
+    for entity, texts in static.items():
+        # The writer marks an entity of signals by their names; bounds and status are unmarked.
+        if _NAMES not in texts:
+            continue
+        names = texts[_NAMES]
+        units = texts.get(_UNITS, [])
+        if len(names) != len(units):
+            raise RecordingError(f"{path} was recorded by another version of rti-cosim")
+        units_of[entity] = dict(zip(names, units, strict=True))
+    if not units_of:
+        raise RecordingError(f"{path} holds no signals of rti-cosim")
+    return units_of
+
+
+def _entities(path: Path) -> tuple[StaticTexts, dict[str, pa.Table]]:
     """The static texts of each entity by component, and the rows of each that has any."""
-    static: dict[str, dict[str, list[str]]] = defaultdict(dict)
+    static: StaticTexts = defaultdict(dict)
     batches: dict[str, list[pa.RecordBatch]] = defaultdict(list)
     for chunk in _chunks(path):
         batch = chunk.to_record_batch()
@@ -112,7 +136,8 @@ def _entities(path: Path) -> tuple[dict[str, dict[str, list[str]]], dict[str, pa
         entity = chunk.entity_path
         if chunk.is_static:
             for column in columns:
-                static[entity][column] = _status_texts(batch.column(column))
+                static[entity][column] = _static_texts(batch.column(column))
+        # Rows without a sample are not of this package.
         elif SAMPLE in columns:
             batches[entity].append(batch)
     rows_of = {entity: _stacked_rows(parts) for entity, parts in batches.items()}
@@ -126,6 +151,7 @@ def _properties(static: Mapping[str, Mapping[str, list[str]]]) -> dict[str, str]
         if not entity.endswith("/run"):
             continue
         for key, text in texts.items():
+            # Rerun's own components stand among ours.
             internal = ":" in key or key == "rerun.controls.RowId"
             if text and not internal:
                 properties[key] = text[0]
@@ -145,6 +171,7 @@ def worst_moment(path: str | Path) -> float | None:
     timed = np.isfinite(recording.time)
     moments = np.where(timed, recording.time, recording.samples)
     violation = recording.signals.get("violation", np.zeros(1))
+    # The end, unless a bound was violated.
     worst = -1
     if np.nanmax(violation, initial=0.0) > VIOLATING:
         worst = int(np.nanargmax(violation))
@@ -160,16 +187,23 @@ def summarise(path: str | Path) -> dict[str, Any]:
     signals = {}
     for name, values in recording.signals.items():
         finite = values[np.isfinite(values)]
+        lowest = None
+        highest = None
+        # JSON has no NaN and no infinity.
+        if finite.size:
+            lowest = float(finite.min())
+            highest = float(finite.max())
         signals[name] = {
             "unit": recording.units[name],
-            "minimum": float(finite.min()) if finite.size else None,
-            "maximum": float(finite.max()) if finite.size else None,
+            "minimum": lowest,
+            "maximum": highest,
         }
+    counts = Counter(recording.status)
     return {
         "properties": recording.properties,
         "samples": len(recording.samples),
         "signals": signals,
-        "statuses": dict(sorted(Counter(recording.status).items())),
+        "statuses": dict(sorted(counts.items())),
     }
 
 
@@ -188,13 +222,15 @@ def _chunks(path: Path) -> list[Chunk]:
             warnings.simplefilter("ignore", RerunWarning)
             return RrdReader(path).stream().to_chunks()
     except (ValueError, RuntimeError, OSError) as error:
+        # Rerun's message may have several lines; an error of ours has one.
+        reason = str(error).splitlines()[0]
         raise RecordingError(
-            f"{path} is not a readable recording ({str(error).splitlines()[0]}); if its process "
-            "was killed, repair it with: rerun rrd optimize FILE -o REPAIRED"
+            f"{path} is not a readable recording ({reason}); if its process was killed, repair it "
+            "with: rerun rrd optimize FILE -o REPAIRED"
         ) from None
 
 
-def _status_texts(column: pa.Array) -> list[str]:
+def _static_texts(column: pa.Array) -> list[str]:
     """Values of a static column, as text."""
     # A static column has one row: a value, or a list of them.
     value: Any = column[0].as_py()
@@ -213,14 +249,17 @@ def _stacked_rows(batches: list[pa.RecordBatch]) -> pa.Table:
 
 def _values(rows: pa.Table, n_signals: int) -> list[NDArray[np.float64]]:
     """Values of each signal of an entity, (K,) or (K, N)."""
-    flat = pc.list_flatten(rows[_SCALARS]).to_numpy()
+    scalars = pc.list_flatten(rows[_SCALARS])
+    flat = scalars.to_numpy()
     # A row has the numbers of the first signal, then those of the next.
     table = flat.reshape(len(rows), n_signals, -1)
     signals = []
     for index in range(n_signals):
         values = np.ascontiguousarray(table[:, index])
-        has_one_number = values.shape[1] == 1
-        signals.append(values[:, 0] if has_one_number else values)
+        # One number a row is a signal; several are a prediction, or a block of θ.
+        if values.shape[1] == 1:
+            values = values[:, 0]
+        signals.append(values)
     return signals
 
 
@@ -234,7 +273,8 @@ def _time(rows: pa.Table) -> NDArray[np.float64]:
 
 def _status(changes: pa.Table, samples: NDArray[np.int64]) -> list[str]:
     """Every sample's status from the changes that were recorded."""
-    words = [states[0] for states in changes[_STATE_COLUMN].to_pylist()]
+    lists = changes[_STATE_COLUMN].to_pylist()
+    words = [states[0] for states in lists]
     changed_at = np.asarray(changes[SAMPLE])
     # The last change at or before each sample.
     following = np.searchsorted(changed_at, samples, side="right")

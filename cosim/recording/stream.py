@@ -134,7 +134,6 @@ class Stream:
         self.rerun = rr.RecordingStream("rti-cosim")
         self.rerun.send_recording_name(drawable(name))
         self._declared: set[str] = set()
-        # The layout goes before the data, or a viewer that opens the file makes its own first.
         save = partial(self.rerun.save, self._partial, default_blueprint=layout)
         self._bounded(save)
         described = rr.AnyValues()

@@ -77,7 +77,13 @@ def render(
         target.write_bytes(_drawn(path, at, size, deadline))
 
 
-def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float) -> bytes:
+def _drawn(
+    path: Path,
+    at: float | None,
+    size: tuple[int, int],
+    deadline: float,
+) -> bytes:
+    """The picture of a recording as the bytes of a PNG; arguments as of `render`."""
     try:
         with _headless(size, deadline) as client:
             client.open(str(path.resolve()))
@@ -87,7 +93,8 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
                 raise RecordingError(f"{path} holds no recording")
             timelines = set()
             for recording in recordings:
-                timelines |= {line.name for line in recording.timelines}
+                for timeline in recording.timelines:
+                    timelines.add(timeline.name)
             if at is not None and TIMELINE in timelines:
                 client.set_time(TIMELINE, duration=at, play_state="paused")
             elif at is not None:
@@ -171,6 +178,7 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
 
 
 def _wait(done: Callable[[], bool], deadline: float, task: str) -> None:
+    """Wait until something is done; raises RecordingError after a deadline of the clock."""
     while not done():
         if time.monotonic() > deadline:
             raise RecordingError(f"{task} took too long")

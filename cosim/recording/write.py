@@ -28,7 +28,7 @@ HELD = ("actions", "disturbances", "signals")
 FIRST_COLORS = {"actions": 2, "measurements": 2, "estimates": 4}
 """Number in `SERIES` of the first colour of a kind; 0 of the others."""
 SECOND_OF_A_VIEW = ("penalty", "feedback_time")
-"""Signals that share a view, or a column, with one in the first colour."""
+"""Signals in the second colour: they stand beside, or in one view with, one in the first."""
 _STATUS_ENTITY = "solver/status"
 _RESIDUAL = "solver/log_residual"
 _GOOD = "#3A9A5B"
@@ -74,6 +74,7 @@ class RerunRecorder:
         self._status: str | None = None
         # A forecast may have driven the plant already.
         self._within.clear()
+        # The viewer shows them when the recording is selected.
         properties = {
             "scenario": scenario.name,
             "scenario_hash": scenario.hash,
@@ -142,7 +143,8 @@ class RerunRecorder:
         samples = np.arange(first, first + len(status))
         rows = times(samples, time)
         # Bounds are lines from the first sample to the last.
-        ends = times(samples[[0, -1]], time[[0, -1]])
+        first_and_last = [0, -1]
+        ends = times(samples[first_and_last], time[first_and_last])
         self._record_signals(stream, columns, rows, ends)
         self._record_residual(stream, columns["residual"], rows)
         self._record_status(stream, samples, time, status)
@@ -198,6 +200,7 @@ class RerunRecorder:
             # (K, stages, n) to n times (K, stages): a channel has a line for each stage.
             entries = np.moveaxis(columns[name], 2, 0)
             for channel, values in zip(channels, entries, strict=False):
+                # As the page about the run explains them.
                 n_stages = values.shape[1]
                 channel.labels = [f"+{stage}" for stage in range(n_stages)]
                 stream.send([channel], rows, values)
@@ -240,7 +243,8 @@ class RerunRecorder:
         # A state at the end of a sample counts to that sample.
         next_row = np.searchsorted(time, moments)
         row = np.maximum(next_row - 1, 0)
-        rows = times(samples[row], moments)
+        samples_of_moments = samples[row]
+        rows = times(samples_of_moments, moments)
         for channel, values in zip(self._fine, states, strict=True):
             stream.send([channel], rows, values)
 
@@ -281,7 +285,6 @@ class RerunRecorder:
             rrb.Vertical(*left),
             rrb.Vertical(*self._middle_views(along)),
             self._right_column(along),
-            # Bounds, and what crosses them, are read on the left.
             column_shares=[4, 3, 3],
         )
         return layout(columns)
@@ -311,7 +314,7 @@ class RerunRecorder:
     def _loop_view(self, channel: Channel, along: rrb.TimeAxis) -> rrb.TimeSeriesView:
         """The plot of a state or an action, with all that is known of it beside its samples."""
         drawn = [channel]
-        # States within a sample lie in the view of the state, where a run has any.
+        # States within a sample lie in the view of the state, where a plant gave any.
         for fine in self._fine:
             if fine.name == channel.name and fine.window():
                 drawn.append(fine)
@@ -336,7 +339,11 @@ class RerunRecorder:
         return rrb.Tabs(rrb.Vertical(*predictions, name="predictions"), page)
 
 
-def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:
+def _channels(
+    kind: SignalKind,
+    scenario: Scenario,
+    units: Mapping[str, str],
+) -> list[Channel]:
     """The signals of a kind as they are drawn; a unit not known is left empty."""
     # What is drawn into one view has unlike colours.
     first_color = FIRST_COLORS.get(kind.name, 0)
@@ -349,7 +356,7 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
         if kind.group in ALONE:
             entity = f"{kind.group}/{escaped(name)}"
         bounds = FREE
-        # A scalar of the run may have the name of a state.
+        # States and inputs are vectors; a scalar of the same name has no bounds.
         if kind.vector and name not in moving:
             bounds = scenario.limits.get(name, FREE)
         second_of_its_view = name in SECOND_OF_A_VIEW

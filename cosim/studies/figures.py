@@ -50,25 +50,38 @@ def draw_regrets(study: StudyMeasurements, scenario: str) -> Figure | None:
     if study.reference("optimum", scenario) is None:
         return None
     optimum = study.about["optimum"][scenario]
-    dots = []
-    for row in study.summary[study.summary.scenario == scenario].to_dict("records"):
-        case = str(row["case"])
-        if case == optimum:
-            continue
-        kind = "regret_iqm" if row["runs"] > 1 else "regret_median"
-        status = study.runs_of(case, scenario).status
-        diverged = status.str.startswith("diverged").to_numpy()
-        dots.append(
-            DotRow(
-                case,
-                values=100 * study.regrets(case, scenario),
-                finished=~diverged,
-                middle=100 * row[kind],
-                low=100 * row[f"{kind}_low"],
-                high=100 * row[f"{kind}_high"],
-            )
-        )
-    return regret_figure(dots, _styles(study)) if dots else None
+    summary = study.summary[study.summary.scenario == scenario]
+    rows = []
+    for row in summary.to_dict("records"):
+        # The optimum is where the axis begins, and no row.
+        if row["case"] != optimum:
+            rows.append(_regret_dots(study, row))
+    if not rows:
+        return None
+    return regret_figure(rows, _styles(study))
+
+
+def _regret_dots(study: StudyMeasurements, row: Mapping[str, Any]) -> DotRow:
+    """The regrets of a case's runs, in %.
+
+    Args:
+        study: the measurements.
+        row: the case's row of the summary.
+    """
+    case = str(row["case"])
+    scenario = str(row["scenario"])
+    # Of a single run there is an interval over the noise alone, which is the median's.
+    kind = "regret_iqm" if row["runs"] > 1 else "regret_median"
+    status = study.runs_of(case, scenario).status
+    diverged = status.str.startswith("diverged").to_numpy()
+    return DotRow(
+        case,
+        values=100 * study.regrets(case, scenario),
+        finished=~diverged,
+        middle=100 * row[kind],
+        low=100 * row[f"{kind}_low"],
+        high=100 * row[f"{kind}_high"],
+    )
 
 
 def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Figure:
@@ -86,7 +99,9 @@ def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Fi
         axes = drawn.subplots()
         values = style.dot_rows(axes, rows, styles)
         upper_ends = [row.high for row in rows]
-        style.regret_axis(axes, "x", np.append(values, [0.0, *upper_ends]))
+        # Lower ends may be below 0, and the axis need not reach them.
+        shown_values = np.concatenate([values, [0.0], upper_ends])
+        style.regret_axis(axes, "x", shown_values)
         # An arrow stands where an interval leaves the axes.
         left, _ = axes.get_xlim()
         cut = [position for position, row in enumerate(rows) if row.low < left]
@@ -128,6 +143,7 @@ def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
         scenario: its name.
     """
     rows = study.curves[study.curves.scenario == scenario]
+    # Rows of a controller are its cost on the noise of the curves.
     is_training = rows.training_seed.notna()
     trained = rows[is_training]
     # Baselines that are trained, too, are lines at the cost that they end with.
@@ -146,12 +162,8 @@ def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
     curves = {}
     for case, log in learned.groupby("case", sort=False):
         curves[str(case)] = learning_curve(log, best)
-    return curves_figure(
-        curves,
-        levels.to_dict(),
-        _styles(study),
-        relative=best is not None,
-    )
+    is_relative = best is not None
+    return curves_figure(curves, levels.to_dict(), _styles(study), relative=is_relative)
 
 
 def _optimal_cost(
@@ -171,7 +183,11 @@ def _optimal_cost(
     return cost if np.isfinite(cost) else None
 
 
-def _levels(study: StudyMeasurements, scenario: str, costs: pd.Series[float]) -> pd.Series[float]:
+def _levels(
+    study: StudyMeasurements,
+    scenario: str,
+    costs: pd.Series[float],
+) -> pd.Series[float]:
     """Greedy costs of the baselines that a figure of curves shows as lines.
 
     Args:
@@ -186,7 +202,8 @@ def _levels(study: StudyMeasurements, scenario: str, costs: pd.Series[float]) ->
     levels = levels.sort_values(kind="stable")
     # Naive is kept, be it the worst: it is where the curves begin.
     is_naive = levels.index == study.about["naive"].get(scenario)
-    return pd.concat([levels[is_naive], levels[~is_naive]])[:MOST_LEVELS]
+    naive_first = pd.concat([levels[is_naive], levels[~is_naive]])
+    return naive_first[:MOST_LEVELS]
 
 
 def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
@@ -202,7 +219,9 @@ def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
     # A run that diverged has fewer points: those that did not set the axis.
     longest = max(runs, key=lambda points: points.shape[1])
     samples = longest[0]
-    padded = [_padded(points, len(samples)) for points in runs]
+    n_points = len(samples)
+    padded = [_padded(points, n_points) for points in runs]
+    # From runs of rows to rows of runs: (R, 3, K) to three times (R, K).
     _, training, greedy = np.stack(padded, axis=1)
     if best is not None:
         training = 100 * regrets(training, best)
@@ -214,11 +233,17 @@ def _points_of_a_run(log: pd.DataFrame) -> Array:
     """Samples, mean training cost and greedy cost at each greedy evaluation of a run, (3, K)."""
     evaluated = log.greedy_J.notna()
     # Rows up to a greedy evaluation belong to it: number them by the evaluations that follow.
-    evaluations_left = evaluated[::-1].cumsum()[::-1]
+    from_the_end = evaluated[::-1].cumsum()
+    evaluations_left = from_the_end[::-1]
+    # Negative, so that the groups come in the order of the samples.
     training = log.J.groupby(-evaluations_left).mean()
     # Rows behind the last evaluation make no point.
-    training = training.iloc[: evaluated.sum()]
-    points = [log.samples[evaluated], training, log.greedy_J[evaluated]]
+    n_points = evaluated.sum()
+    points = [
+        log.samples[evaluated],
+        training.iloc[:n_points],
+        log.greedy_J[evaluated],
+    ]
     return np.array(points, dtype=np.float64)
 
 
@@ -248,13 +273,24 @@ def curves_figure(
     """
     unit = "regret %" if relative else "J"
     columns = _columns_by_start(curves)
-    height = max(2.6, 0.135 * (len(curves) + len(levels)))
+    # As many names as lines and levels stand right of a panel.
+    n_names = len(curves) + len(levels)
+    height = max(2.6, 0.135 * n_names)
+    training = {name: curve.training for name, curve in curves.items()}
+    greedy = {name: curve.greedy for name, curve in curves.items()}
     rows = {
-        "training samples": {name: curve.training for name, curve in curves.items()},
-        "greedy policy": {name: curve.greedy for name, curve in curves.items()},
+        "training samples": training,
+        "greedy policy": greedy,
     }
+    end = max(float(curve.samples[-1]) for curve in curves.values())
     with style.figure(2 * height + 0.4) as drawn:
-        grid = drawn.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
+        grid = drawn.subplots(
+            2,
+            len(columns),
+            sharex=True,
+            sharey="row",
+            squeeze=False,
+        )
         labels: list[tuple[Axes, list[EndLabel]]] = []
         for row, (kind, costs) in zip(grid, rows.items(), strict=True):
             for axes, (start, names) in zip(row, columns.items(), strict=True):
@@ -262,14 +298,16 @@ def curves_figure(
                 lines = _median_lines(axes, start, panel, costs, styles)
                 ends = style.cost_lines(axes, lines, levels, relative=relative)
             # The legend below names the rules of several panels; the last one names the levels.
-            labels.append((axes, ends[: len(levels)] if start else ends))
+            if start:
+                ends = ends[: len(levels)]
+            labels.append((axes, ends))
             if relative:
+                # Panels of a row share their ordinate, which must show the data of all.
                 limits = [axes.dataLim.intervaly for axes in row]
                 style.regret_axis(row[0], "y", np.concatenate(limits))
             row[0].set_ylabel(f"{unit} of the {kind}")
         for axes, start in zip(grid[0], columns, strict=True):
             axes.set_title(start)
-        end = max(float(curve.samples[-1]) for curve in curves.values())
         for axes in grid[1]:
             style.samples_axis(axes, end, "training samples")
         if len(columns) > 1:
@@ -281,13 +319,20 @@ def curves_figure(
 def _columns_by_start(names: Iterable[str]) -> dict[str, list[str]]:
     """Cases by the title of their column; few cases have one column without a title."""
     all_names = list(names)
-    columns: dict[str, list[str]] = {}
-    # Cases without a start are in the last column.
-    for name in sorted(all_names, key=lambda name: "start=" not in name):
+    by_start: dict[str, list[str]] = {}
+    without_start: list[str] = []
+    for name in all_names:
         _, _, settings = name.partition("start=")
-        start = settings.rstrip(")").split(" ")[0]
-        title = f"from {start}" if start else "others"
-        columns.setdefault(title, []).append(name)
+        if not settings:
+            without_start.append(name)
+            continue
+        # Another setting may follow, or the bracket of all.
+        start, _, _ = settings.rstrip(")").partition(" ")
+        by_start.setdefault(f"from {start}", []).append(name)
+    columns = dict(by_start)
+    if without_start:
+        columns["others"] = without_start
+    # One column parts nothing, and many columns are too narrow.
     if len(all_names) <= BANDED or not 1 < len(columns) < BANDED:
         return {"": all_names}
     return columns
@@ -315,6 +360,7 @@ def _median_lines(
     start_setting = start.replace("from", ",")
     lines = []
     for name, curve in curves.items():
+        # A line ends where the first of its runs has diverged.
         is_finite = np.isfinite(costs[name]).all(axis=0)
         samples = curve.samples[is_finite]
         values = costs[name][:, is_finite]
@@ -330,7 +376,14 @@ def _median_lines(
         }
         lines.append(style.CostLine(name, samples, median, look))
         if len(values) > 1 and len(curves) <= BANDED:
-            axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
+            axes.fill_between(
+                samples,
+                low,
+                high,
+                color=color,
+                alpha=0.15,
+                linewidth=0,
+            )
     return lines
 
 
@@ -343,11 +396,12 @@ def _draw_rules_legend(drawn: Figure) -> None:
             # matplotlib names lines without a label so.
             if not rule.startswith("_"):
                 lines.setdefault(rule, line)
-    widest = max(len(rule) for rule in lines)
+    # The line that stands before a name takes the room of ten characters, about.
+    widest = 10 + max(len(rule) for rule in lines)
     drawn.legend(
-        handles=[*lines.values()],
+        handles=list(lines.values()),
         loc="outside lower center",
-        ncols=max(1, PAGE_CHARACTERS // (widest + 10)),
+        ncols=max(1, PAGE_CHARACTERS // widest),
     )
 
 
@@ -396,6 +450,7 @@ def operation_figure(
         "regret": "regret % of θ at that time",
         "life_regret": "regret % of all samples so far",
     }
+    # Both panels have one ordinate, so that what learning costs can be seen.
     all_regrets = 100 * runs[list(titles)].to_numpy(dtype=np.float64)
     with style.figure(3.4) as drawn:
         panels = drawn.subplots(1, 2, sharey=True)
@@ -431,18 +486,32 @@ def _draw_regret_courses(
         styles: of which the colours are taken.
         baselines: cases with a dashed line and no band.
     """
-    dashes = palette([str(case) for case in runs.case.unique()])
+    # Dashes are of the cases that are drawn, colours the same in all figures of the study.
+    dashes = palette(list(runs.case.unique()))
     labels = []
     for group, rows in runs.groupby("case", sort=False):
         case = str(group)
         color = styles[case].color
-        spread = 100 * rows.groupby("samples")[column].agg(["min", "median", "max"])
+        regrets_at_marks = rows.groupby("samples")[column]
+        spread = 100 * regrets_at_marks.agg(["min", "median", "max"])
         samples = spread.index
         median = spread["median"]
         if case in baselines:
-            axes.plot(samples, median, color=color, linestyle=DASHED, linewidth=0.9)
+            axes.plot(
+                samples,
+                median,
+                color=color,
+                linestyle=DASHED,
+                linewidth=0.9,
+            )
         else:
-            axes.plot(samples, median, color=color, linestyle=dashes[case].line, linewidth=1.5)
+            axes.plot(
+                samples,
+                median,
+                color=color,
+                linestyle=dashes[case].line,
+                linewidth=1.5,
+            )
             axes.fill_between(
                 samples,
                 spread["min"],
@@ -451,7 +520,8 @@ def _draw_regret_courses(
                 alpha=0.12,
                 linewidth=0,
             )
-        labels.append(EndLabel(shown_case(case), float(median.iloc[-1]), color))
+        end = float(median.iloc[-1])
+        labels.append(EndLabel(shown_case(case), end, color))
     return labels
 
 

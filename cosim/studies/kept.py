@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from cosim.core.errors import StudyError
 from cosim.core.files import write_atomically
 from cosim.core.protocols import Array
+from cosim.core.scenario import Scenario
 from cosim.core.statistics import td_error_mean
 from cosim.core.training_options import LOG, PARAMETERS
-from cosim.core.trajectory import read_csv
+from cosim.core.trajectory import Trajectory, read_csv
 from cosim.figures import style
 from cosim.figures.states import Policy, density_figure, phase_figure
 from cosim.figures.training import parameters_figure
@@ -36,12 +37,13 @@ def keep_files(plan: StudyPlan, out: Path) -> None:
     """
     for run in plan.runs:
         for name, kept in run.kept.items():
-            # A run that is not finished may lack it.
             source = out / run.folder / name
-            if source.is_file():
-                target = out / kept
-                target.parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(target, source.read_bytes())
+            # A run that is not finished may lack it.
+            if not source.is_file():
+                continue
+            target = out / kept
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(target, source.read_bytes())
 
 
 def draw_kept(plan: StudyPlan, out: Path, formats: Sequence[str] = style.FORMATS) -> list[str]:
@@ -64,22 +66,21 @@ def draw_kept(plan: StudyPlan, out: Path, formats: Sequence[str] = style.FORMATS
 
 def _trajectory_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]]:
     """Names and figures of the kept trajectories."""
-    for name, scenario in plan.definition.scenarios.items():
-        for table in plan.definition.table.trajectory:
+    definition = plan.definition
+    for name, scenario in definition.scenarios.items():
+        for table in definition.table.trajectory:
             runs = _runs_with(table.file, name, plan, out)
             if not runs:
                 continue
             trajectories = {}
             for case, run in runs.items():
                 trajectory = read_csv(out / run.kept[table.file], scenario)
+                # The study's name of it, which may be another than the controller's own.
                 trajectories[case] = replace(trajectory, controller=case)
             for kind in table.figures:
                 stem = f"{kind}-{folder_name(name)}-{table.name}"
                 if kind == "trajectory":
-                    # Their axes span all runs, so that the figures can be compared.
-                    beside = list(trajectories.values())
-                    for case, trajectory in trajectories.items():
-                        drawn = trajectory_figure(trajectory, scenario, beside=beside)
+                    for case, drawn in _single_figures(trajectories, scenario):
                         yield f"{stem}-{folder_name(case)}", drawn
                 elif kind == "overlay":
                     yield stem, overlay_figure(trajectories)
@@ -90,12 +91,26 @@ def _trajectory_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figur
                     yield stem, phase_figure(trajectories, policies, scenario)
 
 
+def _single_figures(
+    trajectories: Mapping[str, Trajectory],
+    scenario: Scenario,
+) -> Iterator[tuple[str, Figure]]:
+    """A figure of each trajectory, by case."""
+    # Their axes span all runs, so that the figures can be compared.
+    beside = list(trajectories.values())
+    for case, trajectory in trajectories.items():
+        yield case, trajectory_figure(trajectory, scenario, beside=beside)
+
+
 def _runs_with(file: str, scenario: str, plan: StudyPlan, out: Path) -> dict[str, Run]:
     """Runs on a scenario of which the study has kept a file, by case."""
     runs = {}
     for run in plan.runs:
         kept = run.kept.get(file)
-        if run.scenario.name == scenario and kept is not None and (out / kept).is_file():
+        if run.scenario.name != scenario or kept is None:
+            continue
+        # Of an unfinished study some runs have no file yet.
+        if (out / kept).is_file():
             runs[run.case] = run
     return runs
 
@@ -128,20 +143,22 @@ def _training_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]
     """Names and figures of the kept logs; a run in operation has none."""
     for run in plan.runs:
         kept = run.kept.get(LOG)
-        if run.marks or kept is None or not (out / kept).is_file():
+        if run.marks or kept is None:
             continue
-        log = read_table(out / kept)
+        path = out / kept
+        if not path.is_file():
+            continue
+        log = read_table(path)
         blocks = increments(log)
         # A log without θ has nothing to draw.
         if not blocks:
             continue
         samples = log["samples"].to_numpy(float)
-        td_error = td_error_mean(
-            samples,
-            log["td_error"].to_numpy(float),
-            log["updates"].to_numpy(float),
-        )
-        yield f"parameters-{Path(kept).stem}", parameters_figure(samples, blocks, td_error)
+        error_of_row = log["td_error"].to_numpy(float)
+        updates = log["updates"].to_numpy(float)
+        td_error = td_error_mean(samples, error_of_row, updates)
+        drawn = parameters_figure(samples, blocks, td_error)
+        yield f"parameters-{path.stem}", drawn
 
 
 def increments(log: pd.DataFrame) -> dict[str, Array]:
@@ -150,5 +167,9 @@ def increments(log: pd.DataFrame) -> dict[str, Array]:
     changes = theta - theta.iloc[0]
     # A column is called `theta BLOCK[i,j]`.
     entries = changes.columns.str.removeprefix(THETA_PREFIX)
-    blocks = entries.str.split("[").str[0]
-    return {block: changes.loc[:, blocks == block].to_numpy() for block in blocks.unique()}
+    block_of_column = entries.str.split("[").str[0]
+    by_block = {}
+    for block in block_of_column.unique():
+        is_of_block = block_of_column == block
+        by_block[block] = changes.loc[:, is_of_block].to_numpy()
+    return by_block

@@ -57,7 +57,8 @@ def plant_at(scenario: Scenario, time: float) -> Scenario:
     if moving_parameter is None:
         return scenario.at(time)
     name, value_at = moving_parameter
-    return frozen(scenario, name, float(value_at(time)))
+    value = float(value_at(time))
+    return frozen(scenario, name, value)
 
 
 def optimum_at(scenario: Scenario, sample: int) -> Controller:
@@ -69,7 +70,11 @@ def optimum_at(scenario: Scenario, sample: int) -> Controller:
     position = moving.law.position(time)
     # The plant stands still from here on: its position no longer depends on the time.
     standing_law = replace(moving.law, position=lambda _: position)
-    return QuasiStaticPolicy(standing_law, moving.policies, scenario.sampling_time)
+    return QuasiStaticPolicy(
+        standing_law,
+        moving.policies,
+        scenario.sampling_time,
+    )
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,7 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
                     cost[k], update = loop.advance()
                     if update is not None:
                         n_updates += 1
+                    # An update may be refused, and θ then stays.
                     has_moved = not np.array_equal(start_theta, loop.controller.theta)
                     if has_moved and not first_change:
                         first_change = n_samples
@@ -140,8 +146,10 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
                 first_change,
                 run.scenario.memory,
             )
+            # A rule without a model of its own has no samples of it.
+            model_samples = getattr(loop.algorithm, "model_samples", 0)
             metrics["updates"] = float(n_updates)
-            metrics["model_samples"] = float(getattr(loop.algorithm, "model_samples", 0))
+            metrics["model_samples"] = float(model_samples)
             rows.append(LogRow(metrics, loop.parameters))
         return OperationRun(rows, status, processor_seconds, loop.counts.number)
 
@@ -151,8 +159,15 @@ def _cost_of_the_start(run: TrainingRun, plant: FmuPlant) -> Array:
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
     compile_functions(controller, run.samples)
     law = measured(run.scenario, controller)
-    signals = simulate(plant, law, run.samples, run.seed, residuals=False).signals
-    return signals["stage_cost"].values + signals["penalty"].values
+    trajectory = simulate(
+        plant,
+        law,
+        run.samples,
+        run.seed,
+        residuals=False,
+    )
+    stage_cost: Array = trajectory["stage_cost"]
+    return stage_cost + trajectory["penalty"]
 
 
 def operation_metrics(
@@ -277,7 +292,12 @@ def theta_at(log: str, mark: int) -> tuple[float, ...]:
         θ, (n_θ,).
     """
     for row in csv.DictReader(log.splitlines()):
-        if int(row["samples"]) == mark:
-            columns = [name for name in row if name.startswith(THETA_PREFIX)]
-            return tuple(float(row[name]) for name in columns)
+        if int(row["samples"]) != mark:
+            continue
+        # Columns come in the order of θ.
+        theta = []
+        for name, cell in row.items():
+            if name.startswith(THETA_PREFIX):
+                theta.append(float(cell))
+        return tuple(theta)
     raise StudyError(f"a log of a run in operation has no row of {mark} samples")

@@ -14,6 +14,8 @@ from cosim.studies.ranks import NO_SEED, costs_more, paired_runs, shared_ranks
 
 CostsByMark = dict[int, pd.DataFrame]
 """J by mark, a row for each training seed and a column for each seed of the noise, (R, S)."""
+SAME_NOISE = ["training_seed", "samples"]
+"""Columns that say a run's noise: that of its training seed, for as many samples."""
 
 
 @dataclass(frozen=True)
@@ -75,28 +77,33 @@ def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> 
     """
     costs = _greedy_costs(greedy)
     optimal_costs = costs.pop(optimum, None)
-    # A run's noise is that of its training seed, for as many samples.
-    same_noise = ["training_seed", "samples"]
+    optimal_greedy: dict[int, Array] = {}
     if optimal_costs is None:
-        marks = runs.samples.unique().tolist()
-        optimal_greedy = {mark: _best_cost(costs.values(), mark) for mark in marks}
-        optimal_run_J = runs.groupby(same_noise).J.min()
+        for mark in runs.samples.unique().tolist():
+            optimal_greedy[mark] = _best_cost(costs.values(), mark)
+        optimal_run_J = runs.groupby(SAME_NOISE).J.min()
     else:
-        optimal_greedy = {mark: cost.to_numpy()[0] for mark, cost in optimal_costs.items()}
-        optimal_run_J = runs[runs.case == optimum].set_index(same_noise).J
+        # The optimum is a controller, of which there is one run.
+        for mark, cost in optimal_costs.items():
+            optimal_greedy[mark] = cost.to_numpy()[0]
+        runs_of_optimum = runs[runs.case == optimum]
+        optimal_run_J = runs_of_optimum.set_index(SAME_NOISE).J
 
+    # J* of each run's own noise, and J of its final θ, beside the run.
+    run_key = ["case", *SAME_NOISE]
+    greedy_J = greedy.groupby(run_key).J.mean()
+    greedy_J = greedy_J.rename("greedy_J").reset_index()
+    optimal_run_J = optimal_run_J.rename("optimal_J")
     rows = runs[runs.case != optimum]
-    run_key = ["case", *same_noise]
-    greedy_J = greedy.groupby(run_key).J.mean().rename("greedy_J")
-    rows = rows.merge(optimal_run_J.rename("optimal_J"), on=same_noise, how="left")
-    rows = rows.merge(greedy_J.reset_index(), on=run_key, how="left")
+    rows = rows.merge(optimal_run_J, on=SAME_NOISE, how="left")
+    rows = rows.merge(greedy_J, on=run_key, how="left")
 
     # The greedy policies of a mark share its noise, the whole runs of a training seed theirs.
-    optimal_greedy_J = {mark: float(cost.mean()) for mark, cost in optimal_greedy.items()}
-    rows["regret"] = regrets(
-        rows.greedy_J.to_numpy(),
-        rows.samples.map(optimal_greedy_J).to_numpy(),
-    )
+    optimal_greedy_J = {}
+    for mark, cost in optimal_greedy.items():
+        optimal_greedy_J[mark] = float(cost.mean())
+    optimal_at_mark = rows.samples.map(optimal_greedy_J)
+    rows["regret"] = regrets(rows.greedy_J.to_numpy(), optimal_at_mark.to_numpy())
     optimal_J = rows.optimal_J.to_numpy()
     rows["life_regret"] = regrets(rows.J.to_numpy(), optimal_J)
     rows["dearest"] = regrets(rows.dearest.to_numpy(), optimal_J)
@@ -107,11 +114,16 @@ def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> 
 def _greedy_costs(greedy: pd.DataFrame) -> dict[str, CostsByMark]:
     """J by case and mark."""
     costs: dict[str, CostsByMark] = {}
-    for (case, mark), rows in greedy.groupby(["case", "samples"], sort=False):
-        seeds = rows.training_seed.fillna(NO_SEED)
-        numbered = rows.assign(training_seed=seeds)
-        table = numbered.pivot(index="training_seed", columns="seed", values="J")
-        costs.setdefault(case, {})[int(mark)] = table
+    # A controller has no training seed, and a table needs an index.
+    seeds = greedy.training_seed.fillna(NO_SEED)
+    numbered = greedy.assign(training_seed=seeds)
+    for (case, mark), rows in numbered.groupby(["case", "samples"], sort=False):
+        costs_at_marks = costs.setdefault(case, {})
+        costs_at_marks[int(mark)] = rows.pivot(
+            index="training_seed",
+            columns="seed",
+            values="J",
+        )
     return costs
 
 

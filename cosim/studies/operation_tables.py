@@ -120,9 +120,11 @@ def _greedy_rows(result: OperationResult, marks: Sequence[int]) -> list[list[str
         rank = ranks.get(case)
         cells = [case, "" if rank is None else str(rank)]
         for mark in marks:
-            regret = runs[runs.samples == mark].regret.to_numpy()
-            cost = result.greedy[case][mark].to_numpy()
-            interval = two_way(cost, result.optimum[mark])
+            runs_at_mark = runs[runs.samples == mark]
+            cost = result.greedy[case][mark]
+            # All runs of a case meet the same noise: seeds of both kinds are drawn anew.
+            interval = two_way(cost.to_numpy(), result.optimum[mark])
+            regret = runs_at_mark.regret.to_numpy()
             cells.append(_regret_cell(regret, interval))
         rows.append(cells)
     return rows
@@ -134,7 +136,9 @@ def _run_rows(runs: pd.DataFrame, marks: Sequence[int]) -> list[list[str]]:
     for case, case_runs in runs.groupby("case", sort=False):
         cells = [str(case)]
         for mark in marks:
-            regret = case_runs[case_runs.samples == mark].life_regret.to_numpy()
+            runs_at_mark = case_runs[case_runs.samples == mark]
+            regret = runs_at_mark.life_regret.to_numpy()
+            # A run's noise is its own: there is one kind of seed to draw.
             interval = median_over_runs(regret).interval
             cells.append(_regret_cell(regret, interval))
         rows.append(cells)
@@ -194,7 +198,9 @@ def _violations_cell(violating: pd.Series[float], samples_per_week: float) -> st
 def _shift_rows(end: pd.DataFrame) -> list[list[str]]:
     """Shifts with a higher cost, of the cases that have moved θ for at least one."""
     rows = []
-    for case, runs in end[end.dearer.notna()].groupby("case", sort=False):
+    moved = end[end.dearer.notna()]
+    for case, runs in moved.groupby("case", sort=False):
+        # In %, as all shares of J*.
         excess = 100 * runs.excess
         rows.append(
             [
@@ -228,15 +234,20 @@ def _difference_rows(
                 cells.append("")
                 continue
             median, interval, p = paired_difference(cost, other_cost, result.optimum[mark])
-            difference = _share_cell(median, interval)
-            cells.append(difference if np.isnan(p) else f"{difference}, p {p:.2f}")
+            cell = _share_cell(median, interval)
+            # Few pairs have no p.
+            if not np.isnan(p):
+                cell += f", p {p:.2f}"
+            cells.append(cell)
         rows.append(cells)
     return rows
 
 
 def _share_cell(share: float, interval: Interval = None) -> str:
+    """A share in per cent, with its interval if there is one."""
     return shown(share, interval, scale=100.0, digits=3)
 
 
 def _whole(value: float) -> str:
+    """A number without decimals; empty where it is not known."""
     return "" if np.isnan(value) else f"{value:.0f}"

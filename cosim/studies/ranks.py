@@ -33,6 +33,7 @@ def shared_ranks(
     ranks: dict[str, int | None] = {}
     leader = ""
     rank = 0
+    # How many cases have a rank so far: after two that share rank 1 comes rank 3.
     place = 0
     for case in cases:
         if case in trained_once:
@@ -60,12 +61,12 @@ def paired_runs(cost: pd.DataFrame, other: pd.DataFrame) -> tuple[Array, Array]:
     has_controller = NO_SEED in cost.index or NO_SEED in other.index
     if not has_controller:
         # Both are in the order of the training seeds, so that rows of one number are a pair.
-        seeds = cost.index
-        cost = cost[seeds.isin(other.index)]
-        other = other[other.index.isin(seeds)]
+        common = cost.index.intersection(other.index)
+        cost = cost[cost.index.isin(common)]
+        other = other[other.index.isin(common)]
     # A controller has one row, which is compared with each run.
-    pair = np.broadcast_arrays(cost.to_numpy(), other.to_numpy())
-    return pair[0], pair[1]
+    cost_array, other_array = np.broadcast_arrays(cost.to_numpy(), other.to_numpy())
+    return cost_array, other_array
 
 
 def costs_more(cost: Array, other: Array, optimum: Array) -> bool:

@@ -42,14 +42,17 @@ def write_report(study: StudyMeasurements, figures: Mapping[str, Sequence[str]])
     Returns:
         The HTML page.
     """
+    n_runs = len(study.state)
+    # A study that was given as a mapping has no file: readers are to write one.
+    file = study.about.get("file") or f"{study.name}.toml"
     content = {
         "title": study.about["title"] or study.name,
         "description": study.about["description"],
-        "runs": len(study.state),
-        "missing": study.about["runs"] - len(study.state),
+        "runs": n_runs,
+        "missing": study.about["runs"] - n_runs,
         "sections": _sections(study, figures),
         "every": runs_table(study),
-        "command": ["cosim", "study", "run", study.about.get("file") or f"{study.name}.toml"],
+        "command": ["cosim", "study", "run", file],
         "made": _made_with(study.about["made_with"]),
         "date": _date(study.folder / TIMING),
     }
@@ -61,7 +64,8 @@ def write_report(study: StudyMeasurements, figures: Mapping[str, Sequence[str]])
 
     # The templates have the names of the pages.
     for name in (MARKDOWN, PAGE):
-        write_atomically(study.folder / name, rendered(name, **content, picture=picture))
+        page = rendered(name, **content, picture=picture)
+        write_atomically(study.folder / name, page)
     return study.folder / PAGE
 
 
@@ -101,15 +105,21 @@ def _sections(study: StudyMeasurements, figures: Mapping[str, Sequence[str]]) ->
     """Sections of the report, in its order; figures are named by scenario."""
     sections = []
     for scenario in study.scenarios:
-        table = scenario_table(study, scenario)
-        note = _noise_note(study, scenario)
-        sections.append(Section(f"Scenario {scenario}", table, figures[scenario], note))
+        section = Section(
+            title=f"Scenario {scenario}",
+            table=scenario_table(study, scenario),
+            figures=figures[scenario],
+            note=_noise_note(study, scenario),
+        )
+        sections.append(section)
+    # Of one scenario the aggregate has no rows.
     if len(study.aggregate):
         sections.append(Section("All scenarios", aggregate_table(study)))
     for title, header, rows in further_tables(study):
         sections.append(Section(title, (header, rows)))
-    if study.about["pictures"]:
-        sections.append(Section("Sample by sample", figures=study.about["pictures"]))
+    pictures = study.about["pictures"]
+    if pictures:
+        sections.append(Section("Sample by sample", figures=pictures))
     sections.append(Section("Cases", cases_table(study)))
     return sections
 
@@ -143,10 +153,14 @@ def _image(path: Path) -> dict[str, str]:
     content = path.read_bytes()
     # Within the page, which then needs no other file.
     encoded = base64.b64encode(content).decode()
-    width = re.search(rb'width="([\d.]+)pt"', content)
+    width = "auto"
+    points = re.search(rb'width="([\d.]+)pt"', content)
+    if points:
+        # Larger than on paper, whose letters are too small for a screen.
+        width = f"{1.7 * float(points[1]):.0f}px"
     return {
         "source": f"data:image/svg+xml;base64,{encoded}",
-        "width": f"{1.7 * float(width[1]):.0f}px" if width else "auto",
+        "width": width,
     }
 
 

@@ -75,10 +75,11 @@ def scenario_table(
         if name not in REPORT_COLUMNS:
             raise StudyError(f"a table has no column '{name}'{instead(name, REPORT_COLUMNS)}")
     titles = [REPORT_COLUMNS[name] for name in columns]
-    of_scenario = study.summary[study.summary.scenario == scenario]
+    summaries = study.summary[study.summary.scenario == scenario]
     rows = []
-    for summary in of_scenario.to_dict("records"):
-        cells = _summary_cells(summary | _printed_intervals(study, summary))
+    for summary in summaries.to_dict("records"):
+        intervals = _printed_intervals(study, summary)
+        cells = _summary_cells(summary | intervals)
         rows.append([cells[name] for name in columns])
     return titles, rows
 
@@ -86,9 +87,11 @@ def scenario_table(
 def _known_columns(study: StudyMeasurements, scenario: str) -> list[str]:
     """Columns of a scenario's table of which the study knows something."""
     columns = list(REPORT_COLUMNS)
-    if not any(case.get("against") for case in study.cases.values()):
+    has_counterparts = any(case.get("against") for case in study.cases.values())
+    if not has_counterparts:
         for name in DIFFERENCE_COLUMNS:
             columns.remove(name)
+    # Without a sampling time nobody knows how many samples a week has.
     if study.sampling_time(scenario) is None:
         columns.remove("week")
     return columns
@@ -103,12 +106,13 @@ def _printed_intervals(study: StudyMeasurements, summary: Mapping[str, Any]) -> 
     kind = "regret_median" if trained_once else "regret_wide"
     runs = study.runs_of(case, scenario)
     worst = runs.iloc[int(np.argmax(runs.J))]
+    violations = study.violations_per_week(case, scenario)
     return {
         "regret_shown_low": summary[f"{kind}_low"],
         "regret_shown_high": summary[f"{kind}_high"],
         "regret_worst_low": worst.regret_low,
         "regret_worst_high": worst.regret_high,
-        **columns_of("violations_week", study.violations_per_week(case, scenario)),
+        **columns_of("violations_week", violations),
     }
 
 
@@ -117,6 +121,7 @@ def _summary_cells(row: Mapping[str, Any]) -> dict[str, str]:
     cells = {
         "case": row["case"],
         "rank": "" if pd.isna(row["rank"]) else str(row["rank"]),
+        # A controller is not trained, and takes no samples before it is evaluated.
         "samples": str(row["plant_samples"] or ""),
         "finished": f"{row['finished']}/{row['runs']}" if row["samples"] else "",
         "regret": _percent(row, "regret_median", interval="regret_shown"),
@@ -162,7 +167,10 @@ def cases_table(study: StudyMeasurements) -> TitledRows:
     header = ("case", "algorithm or controller", "samples", "start", "NMPC", "settings")
     rows = []
     for case in study.cases.values():
-        settings = [f"{name} = {json.dumps(value)}" for name, value in case["settings"].items()]
+        settings = []
+        for name, value in case["settings"].items():
+            # As a study file writes it, but for the words of TOML.
+            settings.append(f"{name} = {json.dumps(value)}")
         rows.append(
             [
                 case["name"],
@@ -200,10 +208,13 @@ def further_tables(study: StudyMeasurements) -> Iterator[TextTable]:
     """Title, header and rows of the tables that the study asks for beside its summary."""
     against = {name: case.get("against") for name, case in study.cases.items()}
     for scenario in study.scenarios_in_operation:
-        result = study.operation_result(scenario)
-        layout = study.operation_layout(scenario)
-        seconds = study.processor_seconds(scenario)
-        yield from operation_tables(result, scenario, layout, against, seconds)
+        yield from operation_tables(
+            study.operation_result(scenario),
+            scenario,
+            study.operation_layout(scenario),
+            against,
+            study.processor_seconds(scenario),
+        )
     if "paper" in study.about["tables"]:
         yield paper_table(study)
 
@@ -217,7 +228,9 @@ def paper_table(study: StudyMeasurements) -> TextTable:
     rows = []
     for scenario, case in product(study.scenarios, trained):
         indicators = study.indicators.get((scenario, case))
-        naive, tuned = (study.indicators.get((scenario, name)) for name in PAPER)
+        naive = study.indicators.get((scenario, "naive"))
+        tuned = study.indicators.get((scenario, "tuned"))
+        # A case, or a baseline, may not run on this scenario.
         if indicators is None or naive is None or tuned is None:
             continue
         gains = _gains_over_baselines(indicators, naive, tuned)
@@ -257,15 +270,20 @@ def _gains_over_baselines(
     median_run = by_cost[(len(cost) - 1) // 2]
     ratio = tuned["J"].mean() / naive["J"].mean()
     cells = [f"{ratio:.3f}", _shown_number(cost[median_run])]
+    baselines = (
+        ("(a)", naive, PAPER["naive"]),
+        ("(b)", tuned, PAPER["tuned"]),
+    )
     agrees = []
     for name in ("J", "economic_cost"):
         values = indicators[name][median_run]
-        for letter, baseline, paper in zip("ab", (naive, tuned), PAPER.values(), strict=True):
+        for letter, baseline, papers_gain in baselines:
+            # A controller has one run.
             gain = statistics.gain(values, baseline[name][0])
             cells.append(shown(gain.value, gain.interval, scale=100.0, digits=3))
             # The paper's gains are in J.
-            if name == "J" and abs(100 * gain.value - paper) <= NEAR:
-                agrees.append(f"({letter})")
+            if name == "J" and abs(100 * gain.value - papers_gain) <= NEAR:
+                agrees.append(letter)
     return [*cells, " and ".join(agrees)]
 
 
@@ -296,6 +314,7 @@ def _estimate(
     columns = interval or name
     low = float(row.get(f"{columns}_low", np.nan))
     high = float(row.get(f"{columns}_high", np.nan))
+    # In a table, a missing interval has two empty cells.
     ends = None if np.isnan(low) else (low, high)
     return shown(value, ends, scale, digits)
 

@@ -67,8 +67,11 @@ STORED_SUFFIXES = (".csv", ".toml", ".md")
 
 def stored_results() -> Path:
     """Folder of this version's results: an installed wheel's, else the checkout's."""
-    package = Path(__file__).parents[1] / "results"
-    return package if (package / TOLERANCES).is_file() else package.parents[1] / "results"
+    package = Path(__file__).parents[1]
+    installed = package / "results"
+    if (installed / TOLERANCES).is_file():
+        return installed
+    return package.parent / "results"
 
 
 def stored_studies(folder: Path) -> dict[str, StudyTable]:
@@ -77,8 +80,11 @@ def stored_studies(folder: Path) -> dict[str, StudyTable]:
         raise ResultsError(
             f"'{folder}' holds no stored studies ({TOLERANCES}); name the folder with --results"
         )
-    paths = sorted(path for path in folder.glob("*.toml") if path.name != TOLERANCES)
-    return {path.stem: read_study(path) for path in paths}
+    studies = {}
+    for path in sorted(folder.glob("*.toml")):
+        if path.name != TOLERANCES:
+            studies[path.stem] = read_study(path)
+    return studies
 
 
 def chosen(known: Mapping[str, StudyTable], names: list[str]) -> list[str]:
@@ -96,6 +102,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     """
     target = folder / name
     fresh = folder / WORK / f"{name}.fresh"
+    # Of an attempt that was interrupted.
     shutil.rmtree(fresh, ignore_errors=True)
     left_out = []
     for path in sorted(out.rglob("*")):
@@ -111,8 +118,9 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
         if len(content) > LARGEST:
             left_out.append(relative.as_posix())
             continue
-        (fresh / relative).parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(fresh / relative, content)
+        copy = fresh / relative
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(copy, content)
     # Written beside and moved at the end: an interruption leaves the files that were stored.
     shutil.rmtree(target, ignore_errors=True)
     fresh.replace(target)
@@ -146,7 +154,7 @@ def draw_stored(folder: Path, name: str) -> list[str]:
     results = StudyResults.load(stored)
     names_by_scenario = results.draw(stored / FOLDER, ("svg",))
     names = list(chain(*names_by_scenario.values()))
-    # Of the trajectories and logs that the study keeps.
+    # Of the trajectories and logs that the study keeps, which its plan knows.
     if results.about["pictures"]:
         study = Study.load(folder / f"{name}.toml")
         names += draw_kept(plan(study), stored, ("svg",))
@@ -245,8 +253,11 @@ def table_differences(
     for table in computed:
         if table not in wanted:
             lines.append(f"{name}: {table} is computed but not stored")
-    in_folders_first = sorted(wanted, key=lambda table: ("/" not in table, table))
-    for table in in_folders_first:
+
+    def in_folders_first(table: str) -> tuple[bool, str]:
+        return "/" not in table, table
+
+    for table in sorted(wanted, key=in_folders_first):
         if table not in computed:
             lines.append(f"{name}: {table} is stored but not computed any more")
             continue
@@ -279,6 +290,7 @@ def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
             if name in keys or name in WORD_COLUMNS:
                 columns[name] = cells
             else:
+                # An empty cell is a number that there is not.
                 columns[name] = [float(cell or "nan") for cell in cells]
         table = pd.DataFrame(columns).set_index(keys)
     except (KeyError, TypeError, ValueError) as error:
@@ -293,14 +305,19 @@ def _read_stored(path: Path, keys: list[str]) -> pd.DataFrame:
 def _theta_table(path: Path) -> pd.DataFrame:
     """A θ file as a table of one row: its hash, and each number of θ under its name in a log."""
     document = read_toml(path, f"'{path}'", ResultsError)
-    row = {name: str(document.get(name, "")) for name in ("schema", "hash")}
+    row = {
+        "schema": str(document.get("schema", "")),
+        "hash": str(document.get("hash", "")),
+    }
     blocks: Mapping[str, object] = document.get("theta", {})
     for block, values in blocks.items():
         array = np.asarray(values, dtype=np.float64)
         for index, value in np.ndenumerate(array):
+            entry = block
             # A block that is one number has no index.
-            numbers = ",".join(str(number) for number in index)
-            entry = f"{block}[{numbers}]" if index else block
+            if index:
+                numbers = ",".join(map(str, index))
+                entry = f"{block}[{numbers}]"
             row[f"theta {entry}"] = repr(float(value))
     return pd.DataFrame([row])
 
@@ -344,14 +361,17 @@ def _table_differences(
         if not differs.any():
             continue
         first = int(np.argmax(differs))
-        text = (
-            f"{name}: row {_keys_of_row(stored, common_rows[first])}: signal {signal} is "
-            f"{after.tolist()[first]!r} now, {before.tolist()[first]!r} stored"
-        )
+        row = _keys_of_row(stored, common_rows[first])
+        # As Python's numbers, whose `repr` names no type.
+        value_now = after.tolist()[first]
+        stored_value = before.tolist()[first]
+        text = f"{name}: row {row}: signal {signal} is {value_now!r} now, {stored_value!r} stored"
         if tolerance is not None:
+            # A number without a unit is in units of 1.
             unit = tolerance.unit.removeprefix("1")
             text += f", tolerance {tolerance.absolute:g} {unit}"
         first_differences.append((first, text.rstrip()))
+    # A difference that comes first is the cause of those that follow.
     first_differences.sort(key=lambda difference: difference[0])
     lines += [text for _, text in first_differences]
     return lines + lone_columns
@@ -383,9 +403,14 @@ def _tolerance_of(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -
 
 def _keys_of_row(table: pd.DataFrame, row: object) -> str:
     """The keys of a row of a table, in words."""
+    # pandas has a tuple where there are several keys.
     values = row if isinstance(row, tuple) else (row,)
-    pairs = zip(table.index.names, values, strict=True)
-    return ", ".join(f"{key}={value}" for key, value in pairs if value)
+    words = []
+    for key, value in zip(table.index.names, values, strict=True):
+        # A controller has no training seed.
+        if value:
+            words.append(f"{key}={value}")
+    return ", ".join(words)
 
 
 def _rounded_cell(cell: str) -> str:

@@ -41,7 +41,16 @@ MEASURED_COLUMNS = {
     GREEDY: [*RUN_KEYS, "samples", "seed", "J"],
 }
 """Columns of the tables that runs give; `RAW_TABLES` are those of every study."""
-CASE_FIELDS = ("name", "group", "samples", "nmpc", "settings", "scenarios", "start", "target")
+CASE_FIELDS = (
+    "name",
+    "group",
+    "samples",
+    "nmpc",
+    "settings",
+    "scenarios",
+    "start",
+    "target",
+)
 """What study.json says of a case as it is."""
 
 
@@ -62,27 +71,37 @@ def measured_tables(plan: StudyPlan, stores: Iterable[RunStore]) -> dict[str, pd
             parts[name].append(rows)
     tables = {}
     for name, columns in MEASURED_COLUMNS.items():
-        # A study without operation has no rows of some tables.
-        rows = pd.concat(parts[name] or [pd.DataFrame()], ignore_index=True)
-        tables[name] = typed(rows.reindex(columns=columns))
+        # A study without operation has no rows of some tables; one frame is needed to join.
+        frames = parts[name] or [pd.DataFrame()]
+        rows = pd.concat(frames, ignore_index=True)
+        # A log has more columns than its table.
+        table = rows.reindex(columns=columns)
+        tables[name] = typed(table)
     return tables
 
 
 def _finished(plan: StudyPlan, stores: Iterable[RunStore]) -> list[RunStore]:
     """The finished runs by scenario and case, in the order of the study."""
     cases = [case.name for case in plan.definition.all_cases]
-    order = product(plan.definition.scenarios, cases)
-    positions = {where: position for position, where in enumerate(order)}
+    order = list(product(plan.definition.scenarios, cases))
     finished = [store for store in stores if store.complete]
+
+    def position(store: RunStore) -> int:
+        return order.index((store.run.scenario.name, store.run.case))
+
     # The sort is stable: runs of one case stay in the order of their seeds.
-    finished.sort(key=lambda store: positions[store.run.scenario.name, store.run.case])
+    finished.sort(key=position)
     return finished
 
 
 def _rows_of_run(store: RunStore) -> Iterator[tuple[str, pd.DataFrame]]:
     """Rows that a finished run gives to the tables, by the table's file."""
     run = store.run
-    key = {"scenario": run.scenario.name, "case": run.case, "training_seed": run.seed}
+    key = {
+        "scenario": run.scenario.name,
+        "case": run.case,
+        "training_seed": run.seed,
+    }
     state = {
         # A controller is not trained, and has no status of its own.
         "status": store.status or "evaluated",
@@ -91,7 +110,8 @@ def _rows_of_run(store: RunStore) -> Iterator[tuple[str, pd.DataFrame]]:
     }
     yield RUNS_TABLE, pd.DataFrame([key | state])
     if run.training is not None:
-        log = read_table(store.folder / LOG).assign(**key)
+        log = read_table(store.folder / LOG)
+        log = log.assign(**key)
         yield CURVES, log
         if run.training.marks:
             yield OPERATION, log
@@ -100,20 +120,27 @@ def _rows_of_run(store: RunStore) -> Iterator[tuple[str, pd.DataFrame]]:
         # A trajectory is kept as a file, not as rows of a table.
         if noise.whole:
             continue
-        rows = store.measured(file).rename_axis("seed").reset_index()
+        rows = store.measured(file)
+        rows = rows.rename_axis("seed").reset_index()
         if file == EVALUATION:
             yield EVALUATION, rows.assign(**key, steps=noise.steps)
         elif file == GREEDY:
-            greedy_J = float(rows.J.mean())
-            yield CURVES, pd.DataFrame([key | {"greedy_J": greedy_J}])
+            # A controller does not learn: one level, without a number of samples.
+            level = key | {"greedy_J": float(rows.J.mean())}
+            yield CURVES, pd.DataFrame([level])
         elif file in run.marks:
             yield GREEDY, rows.assign(**key, samples=run.marks[file])
         else:
             # The optimum runs on the noise of every training seed, as long as up to a mark.
-            key_of_noise = key | {"training_seed": rows.seed, "samples": noise.steps}
-            optimum_runs.append(rows[["J"]].assign(**key_of_noise))
+            key_of_noise = key | {
+                "training_seed": rows.seed,
+                "samples": noise.steps,
+            }
+            costs = rows[["J"]]
+            optimum_runs.append(costs.assign(**key_of_noise))
     if optimum_runs:
         rows = pd.concat(optimum_runs)
+        # As the rows of a training: its marks, then those of the next seed.
         yield OPERATION, rows.sort_values(["training_seed", "samples"])
 
 
@@ -122,12 +149,14 @@ def timing_table(stores: Iterable[RunStore]) -> pd.DataFrame:
     rows = []
     for store in stores:
         name = str(store.run)
+        # A controller takes no time to train.
         timing = store.about.get("timing", {})
         wall_seconds = float(timing.get("wall_seconds", 0.0))
         rows.append((name, wall_seconds))
         processor_seconds: Mapping[str, float] = timing.get("processor_seconds", {})
         for mark, seconds in processor_seconds.items():
-            rows.append((timing_key(name, mark), float(seconds)))
+            key = timing_key(name, mark)
+            rows.append((key, float(seconds)))
     return pd.DataFrame(rows, columns=["run", "training_seconds"])
 
 
@@ -145,11 +174,15 @@ def document(plan: StudyPlan) -> dict[str, Any]:
     """The document study.json of a plan."""
     definition = plan.definition
     scenarios = definition.scenarios
+    sampling_times = {}
     curves = {}
-    if definition.has_curves:
-        for name in scenarios:
+    for name, scenario in scenarios.items():
+        sampling_times[name] = scenario.sampling_time
+        if definition.has_curves:
             noise = definition.held_out(name)
             curves[name] = [len(noise.seeds), noise.steps]
+    # Without its folder, which is another one on another machine.
+    file = Path(definition.file).name if definition.file else None
     about = {
         "schema": SCHEMA,
         "name": definition.name,
@@ -157,14 +190,14 @@ def document(plan: StudyPlan) -> dict[str, Any]:
         "description": definition.table.description,
         "scenarios": list(scenarios),
         "cases": [_about_case(definition, case) for case in definition.all_cases],
-        "file": Path(definition.file).name if definition.file else None,
+        "file": file,
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.named(NAIVE)),
         "curves": curves,
-        "sampling_times": {name: scenarios[name].sampling_time for name in scenarios},
+        "sampling_times": sampling_times,
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
-        "made_with": dict(plan.provenance) | {"commit": _commit()},
+        "made_with": {**plan.provenance, "commit": _commit()},
     }
     about_operation = _about_operation(definition)
     if about_operation:
@@ -190,7 +223,9 @@ def _about_operation(study: Study) -> dict[str, dict[str, Any]]:
     about = {}
     for name, scenario in study.scenarios.items():
         marks = study.marks(name)
-        columns = [mark for mark in study.samples_of(table.columns, name) if mark in marks]
+        # A time at which no θ was taken cannot be shown.
+        wanted = study.samples_of(table.columns, name)
+        columns = [mark for mark in wanted if mark in marks]
         about[name] = {
             "sampling_time": scenario.sampling_time,
             "marks": marks,
@@ -203,10 +238,18 @@ def _about_operation(study: Study) -> dict[str, dict[str, Any]]:
 
 def _commit() -> str:
     """Short commit of the checkout that the package is in, `+` if it was edited; else empty."""
-    folder = str(Path(__file__).parent)
-    command = ["git", "-C", folder, "describe", "--always", "--dirty=+", "--exclude=*"]
+    folder = Path(__file__).parent
+    command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     try:
-        described = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        described = subprocess.run(
+            command,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    # An installed package is in no checkout, and a machine may have no git.
     except (OSError, subprocess.SubprocessError):
         return ""
     return described.stdout.strip()

@@ -98,7 +98,8 @@ class CaseRuns:
     def rows(self) -> list[dict[str, Any]]:
         """A row for each run: its state, J, regret with its interval over the noise, indicators."""
         rows = []
-        for run, state in enumerate(self.state.to_dict("records")):
+        states = self.state.to_dict("records")
+        for run, state in enumerate(states):
             row: dict[str, Any] = {
                 **state,
                 "J": float(self.run_J[run]),
@@ -125,7 +126,9 @@ class CaseRuns:
         # The middle run, or both middle ones.
         middle = list(by_cost[(n_runs - 1) // 2 : n_runs // 2 + 1])
         # One run has no distribution: its regret is the mean, without an interval.
-        regret_iqm = over_runs([regrets]) if n_runs > 1 else Estimate(regrets[0])
+        regret_iqm = Estimate(regrets[0])
+        if n_runs > 1:
+            regret_iqm = over_runs([regrets])
         diverged = self.state.status.str.startswith("diverged")
         row: dict[str, Any] = {
             "scenario": self.scenario,

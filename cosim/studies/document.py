@@ -14,12 +14,20 @@ from cosim.core.validation import SchemaVersion, validated
 
 RunCount = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]
+# A name is a file's, too: no separator, no blank, and not of dots alone.
 StudyName = Annotated[str, Field(pattern=r"^\.*[\w+-][\w.+-]*$")]
 Source = Annotated[str, Field(min_length=1)]
 PerScenario = RunCount | dict[str, RunCount]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""
 DEFAULT = "default"
-FOR_ALGORITHMS = {"samples", "start", "nmpc", "settings", "training", "training_seeds"}
+FOR_ALGORITHMS = {
+    "samples",
+    "start",
+    "nmpc",
+    "settings",
+    "training",
+    "training_seeds",
+}
 """Fields of a case that a controller has no use for."""
 Hour = Annotated[float, Field(gt=0.0, le=1e6)]
 Hours = Annotated[list[Hour], Field(min_length=1)]
@@ -119,9 +127,10 @@ class CaseTable(Table):
         # Their defaults are harmless beside a controller; what is written has no effect.
         set_in_vain = self.model_fields_set & FOR_ALGORITHMS
         if self.controller is not None and set_in_vain:
+            names = ", ".join(sorted(set_in_vain))
             raise ValueError(
-                f"{self._where()}: {', '.join(sorted(set_in_vain))} is for an algorithm; a "
-                "controller is evaluated without training"
+                f"{self._where()}: {names} is for an algorithm; a controller is evaluated without "
+                "training"
             )
         return self
 

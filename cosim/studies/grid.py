@@ -39,13 +39,19 @@ def grid_points(table: CaseTable) -> Iterator[GridPoint]:
     Raises StudyError where an axis is empty, and what an unknown algorithm raises.
     """
     axes = _axes(table)
-    varied = [name for name, values in axes.items() if len(values) > 1]
     for coordinates in product(*axes.values()):
-        point = dict(zip(axes, coordinates, strict=True))
-        # A coordinate that all points have tells no two of them apart.
-        parts = [f"{name}={_text(point[name])}" for name in varied]
-        fields = {name: point.pop(name) for name in GRID_FIELDS}
-        yield GridPoint(" ".join(parts), fields, settings=point)
+        parts = []
+        fields = {}
+        settings = {}
+        for (name, values), value in zip(axes.items(), coordinates, strict=True):
+            # A coordinate that all points have tells no two of them apart.
+            if len(values) > 1:
+                parts.append(f"{name}={_text(value)}")
+            if name in GRID_FIELDS:
+                fields[name] = value
+            else:
+                settings[name] = value
+        yield GridPoint(" ".join(parts), fields, settings)
 
 
 def _axes(table: CaseTable) -> dict[str, list[Any]]:

@@ -54,6 +54,7 @@ class OperationResult:
         for case, costs in self.greedy.items():
             if mark not in costs:
                 continue
+            # Of each run over the noise.
             mean_costs = costs[mark].mean(axis=1)
             medians[case] = float(mean_costs.median())
             if len(mean_costs) == 1:
@@ -104,6 +105,7 @@ def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> 
         optimal_greedy_J[mark] = float(cost.mean())
     optimal_at_mark = rows.samples.map(optimal_greedy_J)
     rows["regret"] = regrets(rows.greedy_J.to_numpy(), optimal_at_mark.to_numpy())
+    # Costs become regrets, and an excess a share of J*: their columns keep their names.
     optimal_J = rows.optimal_J.to_numpy()
     rows["life_regret"] = regrets(rows.J.to_numpy(), optimal_J)
     rows["dearest"] = regrets(rows.dearest.to_numpy(), optimal_J)
@@ -131,7 +133,9 @@ def _best_cost(cases: Iterable[CostsByMark], mark: int) -> Array:
     """Greedy J (S,) of the best case at a mark, its mean over the training seeds."""
     means = []
     for costs in cases:
-        if mark in costs:
-            means.append(costs[mark].to_numpy().mean(axis=0))
+        if mark not in costs:
+            continue
+        cost = costs[mark].to_numpy()
+        means.append(cost.mean(axis=0))
     best: Array = min(means, key=np.mean)
     return best

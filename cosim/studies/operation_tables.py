@@ -235,7 +235,7 @@ def _difference_rows(
                 continue
             median, interval, p = paired_difference(cost, other_cost, result.optimum[mark])
             cell = _share_cell(median, interval)
-            # Few pairs have no p.
+            # A single pair has no p.
             if not np.isnan(p):
                 cell += f", p {p:.2f}"
             cells.append(cell)

@@ -85,6 +85,7 @@ class StudyResults(StudyMeasurements, Shown):
         tables[TIMING] = timing_table(stores)
         if len(results.aggregate):
             tables[AGGREGATE] = results.aggregate
+        # All or none: tables of two states of a study would contradict each other.
         with staged(out, STUDY_FILES) as stage:
             for name, table in tables.items():
                 (stage / name).write_text(frame_csv(table), "utf-8")
@@ -131,7 +132,9 @@ class StudyResults(StudyMeasurements, Shown):
         """
         if name is None:
             name = f"regret-{self.scenarios[0]}"
-        names = [f"{kind}-{scenario}" for scenario, kind in product(self.scenarios, STUDY_FIGURES)]
+        names = []
+        for scenario, kind in product(self.scenarios, STUDY_FIGURES):
+            names.append(f"{kind}-{scenario}")
         drawn = None
         if name in names:
             kind, _, scenario = name.partition("-")

@@ -252,6 +252,7 @@ def functions_for(noise: Mapping[str, Noise]) -> str:
     The two agree but for last digits, which are not to differ among the rows of one table.
     """
     longest = max(evaluation.length for evaluation in noise.values())
+    # A short run does not repay the compiler's time.
     if longest >= LONG and switch() != "never":
         return COMPILED
     return INTERPRETED
@@ -320,10 +321,11 @@ def _train_in_operation(run: TrainingRun, marks: Sequence[int]) -> Trained:
     from learning.log import to_csv  # noqa: PLC0415
 
     done = run_in_operation(run, marks)
+    last_row = done.rows[-1]
     return Trained(
-        to_csv(done.rows),
-        done.rows[-1].parameters.to_toml(),
-        done.status,
+        log=to_csv(done.rows),
+        parameters=last_row.parameters.to_toml(),
+        status=done.status,
         samples=marks[-1],
         plant_samples=done.plant_samples,
         processor_seconds=done.processor_seconds,
@@ -335,13 +337,16 @@ def _train_in_episodes(run: TrainingRun, folder: Path) -> Trained:
     from learning.log import to_csv  # noqa: PLC0415
     from learning.training import run_training  # noqa: PLC0415
 
-    result = run_training(run, folder, resume=(folder / CHECKPOINT).is_file())
+    has_checkpoint = (folder / CHECKPOINT).is_file()
+    result = run_training(run, folder, resume=has_checkpoint)
+    last_row = result.rows[-1]
     return Trained(
-        to_csv(result.rows),
+        log=to_csv(result.rows),
         # A study reports what the rule learned, be it worse than the start.
-        result.learned.to_toml(),
-        result.status,
-        samples=int(result.rows[-1]["samples"]),
+        parameters=result.learned.to_toml(),
+        status=result.status,
+        # A run that diverged ends early.
+        samples=int(last_row["samples"]),
         plant_samples=result.plant_samples,
     )
 
@@ -369,6 +374,7 @@ class RunStore:
         self._measured: dict[str, dict[int, dict[str, Any]]] = {}
         self._unwritten: set[str] = set()
         self._quiet_until = 0.0
+        # A link could lead anywhere, and what is damaged is deleted.
         if not self.folder.resolve().is_relative_to(out.resolve()):
             raise StudyError(f"'{self.folder}' leads out of '{out}'; choose another --out")
         # Of an attempt before this one.
@@ -380,7 +386,8 @@ class RunStore:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.about = {}
             self._note(facts=self._facts(), status="")
-        for file in run.noise:  # a damaged one is named before the work
+        # A damaged one is named before the work.
+        for file in run.noise:
             self.missing(file)
 
     def _facts(self) -> dict[str, Any]:
@@ -473,14 +480,16 @@ class RunStore:
             return {}
         columns = () if file == TIMING else INDICATORS
         try:
-            rows = read_table(path, columns, NOISE_KEY).set_index("seed")
+            rows = read_table(path, columns, NOISE_KEY)
         except StudyError:
             self.remarks.append(f"'{path}' is damaged; made anew")
             return {}
         # Rows of an earlier study in this folder may be of runs of another length.
         noise = self._noise(file)
-        same_length = (rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)
-        rows = rows[same_length].drop(columns=["steps", "burn_in"])
+        same_steps = rows.steps == noise.steps
+        same_burn_in = rows.burn_in == noise.burn_in
+        rows = rows[same_steps & same_burn_in]
+        rows = rows.drop(columns=["steps", "burn_in"]).set_index("seed")
         rows = rows[~rows.index.duplicated()]
         measured: dict[int, dict[str, Any]] = rows.to_dict("index")
         return measured
@@ -505,7 +514,10 @@ class RunStore:
         measured = self.indicators(file)
         return tuple(seed for seed in noise.seeds if seed not in measured)
 
-    def items(self, shared_disk: bool) -> Iterator[tuple[str, TrainItem | MeasureItem]]:
+    def items(
+        self,
+        shared_disk: bool,
+    ) -> Iterator[tuple[str, TrainItem | MeasureItem]]:
         """Give out what can be done now, and count what is done.
 
         Args:
@@ -525,10 +537,12 @@ class RunStore:
                 return
             self.done = run.training.samples
         for file, noise in run.noise.items():
-            missing = noise._replace(seeds=self.missing(file))
+            missing_seeds = self.missing(file)
+            missing = noise._replace(seeds=missing_seeds)
             self.done += noise.samples - missing.samples
-            if not missing.seeds:
+            if not missing_seeds:
                 continue
+            # Long enough to be worth its way to a worker, short enough to share the work evenly.
             seeds_of_an_item = max(1, SAMPLES_OF_ITEM // noise.length)
             evaluation = self._evaluation(file, missing)
             for part in evaluation.parts(seeds_of_an_item):
@@ -540,7 +554,8 @@ class RunStore:
         parameters = ""
         if run.training is not None:
             parameters = (self.folder / PARAMETERS).read_text("utf-8")
-        item = MeasureItem(run.conditions, run.source(parameters), noise, run.length)
+        controller = run.source(parameters)
+        item = MeasureItem(run.conditions, controller, noise, run.length)
         mark = run.marks.get(file)
         if mark is None:
             return item
@@ -548,9 +563,11 @@ class RunStore:
         from cosim.studies.operation import optimum_at, plant_at, theta_at  # noqa: PLC0415
 
         time_of_mark = mark * run.scenario.sampling_time
-        item = replace(item, plant=plant_at(run.scenario, time_of_mark))
+        plant = plant_at(run.scenario, time_of_mark)
+        item = replace(item, plant=plant)
         if run.training is None:
-            return replace(item, controller=partial(optimum_at, sample=mark))
+            optimum = partial(optimum_at, sample=mark)
+            return replace(item, controller=optimum)
         log = (self.folder / LOG).read_text("utf-8")
         return replace(item, theta=theta_at(log, mark))
 
@@ -603,7 +620,9 @@ class RunStore:
         while self._unwritten:
             file = self._unwritten.pop()
             noise = self._noise(file)
-            rows = pd.DataFrame.from_dict(self._measured[file], "index").sort_index()
+            rows = pd.DataFrame.from_dict(self._measured[file], "index")
+            # In the order of the seeds, whichever worker was first.
+            rows = rows.sort_index()
             if file != TIMING:
                 rows = rows[list(INDICATORS)]
             rows.insert(0, "seed", rows.index)
@@ -670,7 +689,9 @@ class Runner:
             other = by_folder.setdefault(folder, run)
             if other is not run:
                 raise StudyError(f"'{run}' and '{other}' would have one folder; rename one of them")
-        self.stores = {str(run): RunStore(out, run) for run in runs}
+        self.stores: dict[str, RunStore] = {}
+        for run in runs:
+            self.stores[str(run)] = RunStore(out, run)
         self.failures: dict[str, Failure] = {}
         """The first failure of each run that failed."""
         # Runs of one case have the same remarks; a dictionary has each once, in their order.
@@ -710,7 +731,8 @@ class Runner:
             if name in self.failures or store.complete:
                 continue
             for number, (file, item) in enumerate(store.items(shared_disk)):
-                items[WorkKey(name, file, number)] = item
+                key = WorkKey(name, file, number)
+                items[key] = item
             # A run that lacks nothing is complete without an item.
             store.seal()
         self._tell("")
@@ -753,8 +775,10 @@ class Runner:
 def _end_of_run(name: str, store: RunStore) -> str:
     """A line on a run that is done."""
     indicators = store.indicators(EVALUATION)
-    costs = [indicators[seed]["J"] for seed in store.run.noise[EVALUATION].seeds]
-    line = f"{name}: J {sum(costs) / len(costs):.6g}"
+    seeds = store.run.noise[EVALUATION].seeds
+    costs = [indicators[seed]["J"] for seed in seeds]
+    mean_cost = sum(costs) / len(costs)
+    line = f"{name}: J {mean_cost:.6g}"
     # Without the reason of a divergence, which was reported as it happened.
     status, _, _ = store.status.partition(":")
     return f"{line}, {status}" if status else line

@@ -155,7 +155,10 @@ class LineStyle(NamedTuple):
     line: Any
 
 
-def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, LineStyle]:
+def palette(
+    names: Sequence[str],
+    scenarios: Iterable[str] = (),
+) -> dict[str, LineStyle]:
     """A line style for each controller or case.
 
     Cases of one rule, `rule` and `rule(start=naive)`, share a colour and differ in their line; so
@@ -326,9 +329,11 @@ def dot_rows(axes: Axes, rows: Sequence[DotRow], styles: Mapping[str, LineStyle]
     for position, row in enumerate(rows):
         _dot_row(axes, position, row, styles[row.case].color)
         names.append(shown_case(row.case))
-    axes.set_yticks(range(len(rows)), names)
+    n_rows = len(rows)
+    axes.set_yticks(range(n_rows), names)
     # The first row is above.
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_ylim(n_rows - 0.4, -0.6)
+    # A grid line would lie on the dots of its row.
     axes.grid(axis="y", visible=False)
     return np.concatenate([row.values for row in rows])
 
@@ -464,9 +469,10 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
 def _height(axes: Axes, y: float) -> float:
     """Where an ordinate lies on the page, as a share of the axes' height."""
     low, high = axes.get_ylim()
-    # Through the page, since the ordinate may be logarithmic.
-    points = axes.transData.transform([(0, low), (0, high), (0, y)])
-    bottom, top, here = points[:, 1]
+    points = [(0, low), (0, high), (0, y)]
+    # By way of the page, since the ordinate may be logarithmic.
+    on_page = axes.transData.transform(points)
+    bottom, top, here = on_page[:, 1]
     return float((here - bottom) / (top - bottom))
 
 

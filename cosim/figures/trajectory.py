@@ -94,7 +94,9 @@ def trajectory_figure(
             lowest.set_xlabel(f"time [{unit}]")
         # The last input is held for a sample more.
         last_step = time[1] - time[0] if len(time) > 1 else 1.0
-        panels[left[0]].set_xlim(time[0], time[-1] + last_step)
+        end = time[-1] + last_step
+        # All panels share their abscissa.
+        panels[left[0]].set_xlim(time[0], end)
         drawn.align_ylabels()
         drawn.suptitle(_title(trajectory, scenario))
     return drawn
@@ -235,8 +237,9 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
     scenario = first.scenario
     scale, unit = time_unit(first.time)
     styles = palette(list(runs))
-    with figure(1.2 * len(scenario.limits) + 0.6) as drawn:
-        panels = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
+    n_panels = len(scenario.limits)
+    with figure(1.2 * n_panels + 0.6) as drawn:
+        panels = _stacked_panels(drawn, n_panels)
         for axes, (name, bounds) in zip(panels, scenario.limits.items(), strict=True):
             for controller, run in runs.items():
                 time = run.time / scale
@@ -245,14 +248,22 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
             # After all lines: how far a bound is drawn depends on the data.
             lower, upper = bounds
             _limits(axes, lower, upper)
-            axes.set_ylabel(label(name, first.signals[name].unit))
+            signal_unit = first.signals[name].unit
+            axes.set_ylabel(label(name, signal_unit))
+        begin = first.time[0]
         # The last input is held for a sample more.
         end = first.time[-1] + scenario.sampling_time
-        panels[-1].set_xlim(first.time[0] / scale, end / scale)
+        panels[-1].set_xlim(begin / scale, end / scale)
         panels[-1].set_xlabel(f"time [{unit}]")
         drawn.align_ylabels()
         _draw_costs_legend(panels[0], runs, styles)
     return drawn
+
+
+def _stacked_panels(drawn: Figure, count: int) -> list[Axes]:
+    """Panels below each other that share their abscissa, from above."""
+    grid = drawn.subplots(count, 1, sharex=True, squeeze=False)
+    return list(grid[:, 0])
 
 
 def _draw_costs_legend(
@@ -360,15 +371,15 @@ def episode_image(
     seconds: Array = scenario.sampling_time * samples
     scale, unit = time_unit(seconds)
     time = seconds / scale
-    values = dict(zip(scenario.plant.states, states.T, strict=True))
+    state_values = dict(zip(scenario.plant.states, states.T, strict=True))
     held_values = dict(zip(scenario.plant.actions, actions.T, strict=True))
     n_panels = len(scenario.limits)
     with figure(1.3 * n_panels, 6.0) as drawn:
-        panels = drawn.subplots(n_panels, 1, sharex=True, squeeze=False)[:, 0]
+        panels = _stacked_panels(drawn, n_panels)
         for axes, (name, bounds) in zip(panels, scenario.limits.items(), strict=True):
             axes.set_ylabel(label(name, units[name]))
-            if name in values:
-                axes.plot(time, values[name], color=INK)
+            if name in state_values:
+                axes.plot(time, state_values[name], color=INK)
             else:
                 # An action is held from its sample to the next.
                 axes.stairs(held_values[name], time, color=INK, baseline=None)

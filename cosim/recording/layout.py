@@ -15,7 +15,12 @@ AT = rr.TimeRangeBoundary.absolute
 
 
 def axis(start: rr.TimeRangeBoundary, end: rr.TimeRangeBoundary) -> rrb.TimeAxis:
-    """Horizontal axis over a whole run."""
+    """Horizontal axis over a whole run.
+
+    Args:
+        start: where it begins, a time or a sample.
+        end: where it ends.
+    """
     return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
 
 

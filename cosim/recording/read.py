@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,7 +101,7 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def _units_by_entity(
-    static: Mapping[str, Mapping[str, list[str]]],
+    static: StaticTexts,
     path: str | Path,
 ) -> dict[str, dict[str, str]]:
     """Units of the signals of each entity that holds any, by the signal's name.
@@ -144,7 +143,7 @@ def _entities(path: Path) -> tuple[StaticTexts, dict[str, pa.Table]]:
     return static, rows_of
 
 
-def _properties(static: Mapping[str, Mapping[str, list[str]]]) -> dict[str, str]:
+def _properties(static: StaticTexts) -> dict[str, str]:
     """The run's properties, from the static texts of each entity."""
     properties = {}
     for entity, texts in static.items():

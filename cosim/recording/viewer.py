@@ -126,9 +126,12 @@ def _viewer() -> list[str]:
     if command is None or command.origin is None:
         raise RecordingError("the viewer is not installed; install rerun-sdk")
     folder = Path(command.origin).parent
-    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
     program = folder / ("rerun.exe" if os.name == "nt" else "rerun")
-    return [str(bundled if bundled.exists() else program), "--bind", LOOPBACK]
+    # On macOS it is an application.
+    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
+    if bundled.exists():
+        program = bundled
+    return [str(program), "--bind", LOOPBACK]
 
 
 def _silent(level: str) -> dict[str, str]:

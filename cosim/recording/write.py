@@ -313,16 +313,17 @@ class RerunRecorder:
 
     def _loop_view(self, channel: Channel, along: rrb.TimeAxis) -> rrb.TimeSeriesView:
         """The plot of a state or an action, with all that is known of it beside its samples."""
+        name = channel.name
         drawn = [channel]
         # States within a sample lie in the view of the state, where a plant gave any.
         for fine in self._fine:
-            if fine.name == channel.name and fine.window():
+            if fine.name == name and fine.window():
                 drawn.append(fine)
         # What is measured and estimated of a state is drawn over it.
-        known = (f"measured[{channel.name}]", f"estimated[{channel.name}]")
+        known = (f"measured[{name}]", f"estimated[{name}]")
         for sensor in self._group("sensors"):
             # So is a bound that moves.
-            is_its_bound = self._bounded_by.get(sensor.name) == channel.name
+            is_its_bound = self._bounded_by.get(sensor.name) == name
             if sensor.name in known or is_its_bound:
                 drawn.append(sensor)
         return view(channel.title, drawn, along)

@@ -90,7 +90,15 @@ class Study:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], folder: str | Path = ".") -> Self:
-        """Validate a document, structured like the TOML file; raises StudyError."""
+        """Validate a document that is structured like the TOML file.
+
+        Args:
+            document: the study.
+            folder: from which relative paths and users' modules are looked up.
+
+        Raises:
+            StudyError: the document is no study.
+        """
         table = validated(StudyTable, dict(document), "study", StudyError)
         return cls(table, Path(folder))
 
@@ -328,7 +336,15 @@ class Study:
         return self.samples_of(hours, scenario)
 
     def samples_of(self, hours: Sequence[float], scenario: str) -> tuple[int, ...]:
-        """Hours of operation as samples, increasing."""
+        """Hours of operation as samples, increasing.
+
+        Args:
+            hours: times of operation.
+            scenario: name of the scenario, whose sampling time counts.
+
+        Raises:
+            StudyError: a run would be too long.
+        """
         sampling_time = self.scenarios[scenario].sampling_time
         # Unlike hours may be one sample.
         samples = set()
@@ -463,4 +479,5 @@ def check_known(words: Iterable[str], known: Iterable[str], where: str, kind: st
     """
     for word in words:
         if word not in known:
-            raise StudyError(f"{where}: there is no {kind} '{word}'{instead(word, known)}")
+            suggestion = instead(word, known)
+            raise StudyError(f"{where}: there is no {kind} '{word}'{suggestion}")

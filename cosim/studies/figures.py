@@ -155,7 +155,8 @@ def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
         return None
     controllers = rows[~is_training].set_index("case").greedy_J
     at_the_end = greedy.last().groupby("case").median()
-    levels = _levels(study, scenario, pd.concat([controllers, at_the_end]))
+    costs = pd.concat([controllers, at_the_end])
+    levels = _levels(study, scenario, costs)
     best = _optimal_cost(study, scenario, controllers)
     if best is not None:
         levels[:] = 100 * regrets(levels.to_numpy(), best)

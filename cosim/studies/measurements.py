@@ -113,8 +113,9 @@ class StudyMeasurements:
                 f"'{folder}' holds no study ({ABOUT}); give the --out of a cosim study run"
             )
         about = read_json(path, f"'{path}'", StudyError)
-        if about.get("schema") != SCHEMA:
-            raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
+        schema = about.get("schema")
+        if schema != SCHEMA:
+            raise StudyError(f"'{path}' has schema {schema!r}; this is {SCHEMA}")
         tables = [read_table(folder / name, MEASURED_COLUMNS[name]) for name in RAW_TABLES]
         return cls(folder, about, *tables)
 
@@ -177,7 +178,15 @@ class StudyMeasurements:
         return case_runs
 
     def reference(self, kind: str, scenario: str) -> Array | None:
-        """J (S,) of a scenario's `optimum` or `naive`, or None."""
+        """J of a scenario's optimum, or of its naive NMPC, on the noise of the evaluation.
+
+        Args:
+            kind: `optimum` or `naive`.
+            scenario: name of the scenario.
+
+        Returns:
+            J, (S,); None where it has not run.
+        """
         case = self.about[kind].get(scenario, "")
         measured = self.indicators.get((scenario, case))
         if measured is None:
@@ -187,13 +196,26 @@ class StudyMeasurements:
         return cost
 
     def runs_of(self, case: str, scenario: str) -> pd.DataFrame:
-        """The case's rows of `runs` on a scenario, by training seed."""
+        """Rows of `runs`, by training seed.
+
+        Args:
+            case: name of the case.
+            scenario: name of the scenario.
+        """
         is_scenario = self.runs.scenario == scenario
         is_case = self.runs.case == case
         return self.runs[is_scenario & is_case]
 
     def regrets(self, case: str, scenario: str) -> Array:
-        """Regret (R,) of each run; infinite if J is not finite, NaN if J* is unknown."""
+        """Regret of each run.
+
+        Args:
+            case: name of the case.
+            scenario: name of the scenario.
+
+        Returns:
+            The regrets, (R,); infinite if J is not finite, NaN if J* is unknown.
+        """
         runs = self.case_runs.get((scenario, case))
         return np.empty(0) if runs is None else runs.run_regrets
 
@@ -342,7 +364,11 @@ class StudyMeasurements:
         seeds = runs.training_seed.astype(str)
         # As `Run` writes its name.
         names = runs.case + f" on {scenario}, seed " + seeds
-        keys = names.map(lambda name: timing_key(name, last_mark))
+
+        def key_at_the_end(name: str) -> str:
+            return timing_key(name, last_mark)
+
+        keys = names.map(key_at_the_end)
         seconds = keys.map(timing.training_seconds)
         median_of_case = seconds.groupby(runs.case).median()
         return dict(median_of_case)

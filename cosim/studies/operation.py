@@ -52,7 +52,12 @@ OPERATION_METRICS = [
 
 
 def plant_at(scenario: Scenario, time: float) -> Scenario:
-    """The scenario with its plant frozen at a time in s."""
+    """The scenario with its plant frozen at a time.
+
+    Args:
+        scenario: of a plant that may change with time.
+        time: in s.
+    """
     moving_parameter = fouling(scenario)
     if moving_parameter is None:
         return scenario.at(time)
@@ -62,7 +67,12 @@ def plant_at(scenario: Scenario, time: float) -> Scenario:
 
 
 def optimum_at(scenario: Scenario, sample: int) -> Controller:
-    """The optimal policy of the plant frozen at a sample."""
+    """The optimal policy of the plant frozen at a sample.
+
+    Args:
+        scenario: of a plant that may change with time.
+        sample: number of the sample.
+    """
     time = sample * scenario.sampling_time
     if fouling(scenario) is None:
         return build_controller("optimal", plant_at(scenario, time))
@@ -273,12 +283,15 @@ def compare_shifts(before: Array, cost: Array, memory: float = 0.0) -> ShiftComp
         parts = excess.reshape(n_shifts, n_parts, -1).mean(axis=2)
         mean_excess = parts.mean(axis=1)
         if n_parts == 1:
+            # The spread of one part is unknown.
             return ShiftComparison(np.nan, float(mean_excess.max()))
         p = ttest_1samp(parts, 0.0, axis=1, alternative="greater").pvalue
     # Bonferroni: one shift in twenty runs without an excess is found to be higher, not in each.
     is_significant = p < SHIFT_LEVEL / n_shifts
     is_higher = is_significant | (mean_excess == np.inf)
-    return ShiftComparison(float(is_higher.sum()), float(mean_excess.max()))
+    n_higher = float(is_higher.sum())
+    largest_excess = float(mean_excess.max())
+    return ShiftComparison(n_higher, largest_excess)
 
 
 def theta_at(log: str, mark: int) -> tuple[float, ...]:

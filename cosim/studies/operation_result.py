@@ -45,7 +45,9 @@ class OperationResult:
         Returns:
             J of both, (R, S) each.
         """
-        return paired_runs(self.greedy[case][mark], self.greedy[other][mark])
+        cost = self.greedy[case][mark]
+        other_cost = self.greedy[other][mark]
+        return paired_runs(cost, other_cost)
 
     def ranks(self, mark: int) -> dict[str, int | None]:
         """Ranks of the cases by the median greedy J of their θ at a mark; None where unknown."""
@@ -68,7 +70,11 @@ class OperationResult:
         return shared_ranks(by_cost, trained_once, is_worse)
 
 
-def operation_result(runs: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> OperationResult:
+def operation_result(
+    runs: pd.DataFrame,
+    greedy: pd.DataFrame,
+    optimum: str,
+) -> OperationResult:
     """Regrets of the runs on one scenario; without an optimum, against the best case at the time.
 
     Args:

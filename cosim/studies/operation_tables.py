@@ -202,11 +202,13 @@ def _shift_rows(end: pd.DataFrame) -> list[list[str]]:
     for case, runs in moved.groupby("case", sort=False):
         # In %, as all shares of J*.
         excess = 100 * runs.excess
+        median_higher = _whole(runs.dearer.median())
+        most_higher = _whole(runs.dearer.max())
         rows.append(
             [
                 str(case),
                 str(len(runs)),
-                f"{_whole(runs.dearer.median())} ({_whole(runs.dearer.max())})",
+                f"{median_higher} ({most_higher})",
                 f"{excess.median():.2f} ({excess.max():.2f})",
             ]
         )

@@ -106,8 +106,11 @@ class _CaseOnScenario:
             name: of the scenario.
         """
         scenario = study.scenarios[name]
-        controller = ControllerSource.read(study.located(case.controller or case.start))
+        # What is evaluated as it is, or where θ starts.
+        source = case.controller or case.start
+        controller = ControllerSource.read(study.located(source))
         if case.algorithm is not None:
+            # Settings are validated where a run is made; any seed will do.
             training = study.training(case, name, seed=0, theta=controller.theta)
             training.make_run(scenario)
         elif ":" in (case.controller or ""):

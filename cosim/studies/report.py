@@ -43,7 +43,7 @@ def write_report(study: StudyMeasurements, figures: Mapping[str, Sequence[str]])
         The HTML page.
     """
     n_runs = len(study.state)
-    # A study that was given as a mapping has no file: readers are to write one.
+    # A study that was given as a mapping has no file; the command names one of its name.
     file = study.about.get("file") or f"{study.name}.toml"
     content = {
         "title": study.about["title"] or study.name,
@@ -79,9 +79,15 @@ def rendered(template: str, **context: Any) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters["markdown"] = lambda table: markdown_table(*table)
+    environment.filters["markdown"] = _markdown
     environment.filters["command"] = shlex.join
     return environment.get_template(template).render(context)
+
+
+def _markdown(table: TitledRows) -> str:
+    """A table as Markdown, as templates ask for it."""
+    header, rows = table
+    return markdown_table(header, rows)
 
 
 @dataclass(frozen=True)

@@ -158,6 +158,7 @@ class StudyResults(StudyMeasurements, Shown):
             drawn = []
             for kind, draw in STUDY_FIGURES.items():
                 figure = draw(self, scenario)
+                # Without J*, or a training, there may be nothing to draw.
                 if figure is not None:
                     drawn.append((f"{kind}-{folder_name(scenario)}", figure))
             names[scenario] = save_set(drawn, folder, formats)

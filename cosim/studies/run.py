@@ -87,7 +87,11 @@ TRAINING = ""
 """Stands for the training where a job is named by the file of its result."""
 
 
-def read_table(path: Path, columns: Sequence[str] = (), needed: Sequence[str] = ()) -> pd.DataFrame:
+def read_table(
+    path: Path,
+    columns: Sequence[str] = (),
+    needed: Sequence[str] = (),
+) -> pd.DataFrame:
     """Read a CSV, its columns `typed`.
 
     Args:

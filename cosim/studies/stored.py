@@ -88,7 +88,18 @@ def stored_studies(folder: Path) -> dict[str, StudyTable]:
 
 
 def chosen(known: Mapping[str, StudyTable], names: list[str]) -> list[str]:
-    """The named studies; raises ResultsError for unknown names."""
+    """Check names of studies.
+
+    Args:
+        known: the studies of a folder by name.
+        names: what the user names.
+
+    Returns:
+        The names.
+
+    Raises:
+        ResultsError: there is no such study.
+    """
     for name in names:
         if name not in known:
             raise ResultsError(f"there is no study '{name}'{instead(name, known)}")
@@ -96,9 +107,17 @@ def chosen(known: Mapping[str, StudyTable], names: list[str]) -> list[str]:
 
 
 def store(folder: Path, name: str, out: Path) -> list[str]:
-    """Replace a study's stored files; returns those that were too large.
+    """Replace a study's stored files.
 
     Left out: the runs' own folders, times, and tables of more than `LARGEST` bytes.
+
+    Args:
+        folder: of the stored studies.
+        name: of the study.
+        out: folder of the study that was run.
+
+    Returns:
+        Names of the tables that were too large.
     """
     target = folder / name
     fresh = folder / WORK / f"{name}.fresh"
@@ -162,7 +181,12 @@ def draw_stored(folder: Path, name: str) -> list[str]:
 
 
 def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
-    """Write README.md: title, tables and links of every stored study."""
+    """Write README.md: title, tables and links of every stored study.
+
+    Args:
+        folder: of the stored studies.
+        studies: the studies by name, in the order of the page.
+    """
     results = {}
     for name in studies:
         if (folder / name / ABOUT).is_file():
@@ -341,10 +365,13 @@ def _table_differences(
     ):
         rows = table.index.difference(other.index, sort=False)
         if len(rows):
-            lines.append(f"{name}: row {_keys_of_row(table, rows[0])} is {rows_are}")
+            # Where a run is gone, all its rows are: the first is enough.
+            row = _keys_of_row(table, rows[0])
+            lines.append(f"{name}: row {row} is {rows_are}")
         columns = table.columns.difference(other.columns, sort=False)
         if len(columns):
-            lone_columns.append(f"{name}: signal {', '.join(columns)} is {columns_are}")
+            signals = ", ".join(columns)
+            lone_columns.append(f"{name}: signal {signals} is {columns_are}")
     common_rows = stored.index.intersection(now.index, sort=False)
     # Taken once: to take them for each signal is most of the time that a check needs.
     stored_rows = stored.loc[common_rows]

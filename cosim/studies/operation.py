@@ -169,15 +169,8 @@ def _cost_of_the_start(run: TrainingRun, plant: FmuPlant) -> Array:
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
     compile_functions(controller, run.samples)
     law = measured(run.scenario, controller)
-    trajectory = simulate(
-        plant,
-        law,
-        run.samples,
-        run.seed,
-        residuals=False,
-    )
-    stage_cost: Array = trajectory["stage_cost"]
-    return stage_cost + trajectory["penalty"]
+    signals = simulate(plant, law, run.samples, run.seed, residuals=False).signals
+    return signals["stage_cost"].values + signals["penalty"].values
 
 
 def operation_metrics(

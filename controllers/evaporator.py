@@ -59,38 +59,64 @@ def _flows(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> Flows:
     F1 = disturbance["F1"]
     T1 = disturbance["T1"]
     T200 = disturbance["T200"]
-    k = by_name(PARAMETER_VALUES, p)
-    UA2 = k["UA2"]
-    Cp = k["Cp"]
+    parameter = by_name(PARAMETER_VALUES, p)
+    a = parameter["a"]
+    b = parameter["b"]
+    c = parameter["c"]
+    d = parameter["d"]
+    e = parameter["e"]
+    f = parameter["f"]
+    g = parameter["g"]
+    h = parameter["h"]
+    UA2 = parameter["UA2"]
+    Cp = parameter["Cp"]
+    lambda_ = parameter["lambda_"]
+    lambda_s = parameter["lambda_s"]
+    F3 = parameter["F3"]
 
-    # Temperatures of the liquid, of the vapour and of the steam in °C.
-    T2 = k["a"] * P2 + k["b"] * X2 + k["c"]
-    T3 = k["d"] * P2 + k["e"]
-    T100 = k["f"] * P100 + k["g"]
+    # Temperatures in °C: the liquid boils at its pressure and concentration, vapour and steam
+    # condense at their pressures.
+    T2 = a * P2 + b * X2 + c
+    T3 = d * P2 + e
+    T100 = f * P100 + g
 
-    # Duties of the heater and of the condenser in kW; the feed is warmed up first.
-    UA1 = k["h"] * (F1 + k["F3"])
+    # Heat from the steam in kW. Feed and recirculation pass the heater: both improve its transfer.
+    UA1 = h * (F1 + F3)
     Q100 = UA1 * (T100 - T2)
-    resistance = 1 + UA2 / (2 * Cp * F200)
-    Q200 = UA2 * (T3 - T200) / resistance
-    warming = F1 * Cp * (T2 - T1)
 
-    F4 = (Q100 - warming) / k["lambda_"]
-    F5 = Q200 / k["lambda_"]
-    F100 = Q100 / k["lambda_s"]
-    return Flows(F1 - F4, F4, F5, F100)
+    # Heat to the cooling water in kW, driven by the mean temperature of the water: its heat balance
+    # eliminates the temperature at which it leaves.
+    warming_of_water = 1 + UA2 / (2 * Cp * F200)
+    Q200 = UA2 * (T3 - T200) / warming_of_water
+
+    # Heat balance of the liquid: what does not warm the feed up evaporates water.
+    warming_of_feed = F1 * Cp * (T2 - T1)
+    F4 = (Q100 - warming_of_feed) / lambda_
+    # The level is held: what does not evaporate is drawn off.
+    F2 = F1 - F4
+    F5 = Q200 / lambda_
+    F100 = Q100 / lambda_s
+    return Flows(F2, F4, F5, F100)
 
 
 def _ode(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     """Rates of X2 and P2: M X2' = F1 X1 − F2 X2 and C P2' = F4 − F5."""
     X2 = x[0]
     disturbance = by_name(DISTURBANCES, w)
-    k = by_name(PARAMETER_VALUES, p)
+    X1 = disturbance["X1"]
+    F1 = disturbance["F1"]
+    parameter = by_name(PARAMETER_VALUES, p)
+    M = parameter["M"]
+    C = parameter["C"]
     flows = _flows(x, u, w, p)
-    # Balances of the solute in the liquid, and of the vapour.
-    solute = disturbance["F1"] * disturbance["X1"] - flows.F2 * X2
+
+    # Solute: what the feed brings less what the product takes away.
+    solute_in = F1 * X1
+    solute_out = flows.F2 * X2
+    solute = solute_in - solute_out
+    # Vapour: what evaporates less what condenses.
     vapour = flows.F4 - flows.F5
-    return ca.vertcat(solute / k["M"], vapour / k["C"])
+    return ca.vertcat(solute / M, vapour / C)
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
@@ -98,7 +124,10 @@ def _economic_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     F200 = u[1]
     F3 = by_name(PARAMETER_VALUES, p)["F3"]
     flows = _flows(x, u, w, p)
-    return 10.09 * (flows.F2 + F3) + 600 * flows.F100 + 0.6 * F200
+    pumping = 10.09 * (flows.F2 + F3)
+    steam = 600 * flows.F100
+    cooling_water = 0.6 * F200
+    return pumping + steam + cooling_water
 
 
 STEAM_PRICE = Quantity("steam_price", "min/kg", 600.0)
@@ -113,8 +142,12 @@ def _priced_ode(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
 def _priced_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
     """`_economic_cost` where the last parameter is the price of steam."""
     physical = p[:-1]
+    price = p[-1]
     steam = _flows(x, u, w, physical).F100
-    return _economic_cost(x, u, w, physical) + (p[-1] - STEAM_PRICE.nominal) * steam
+    cost_at_nominal_price = _economic_cost(x, u, w, physical)
+    # The nominal price is in that cost already.
+    surcharge = price - STEAM_PRICE.nominal
+    return cost_at_nominal_price + surcharge * steam
 
 
 def priced_model() -> Model:

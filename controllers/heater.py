@@ -14,11 +14,12 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     M, T = ca.vertsplit(x)
     F, Q = ca.vertsplit(u)
     Fin, Tin = ca.vertsplit(d)
-    # A kW is 60 kJ a minute.
+    content = Fin - F
+    # Heat over the heat capacity of water, in kg·K/min; a kW is 60 kJ a minute.
     from_feed = Fin * (Tin - T)
     from_heater = 60 * Q / CP
     warming = (from_feed + from_heater) / M
-    return ca.vertcat(Fin - F, warming)
+    return ca.vertcat(content, warming)
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
@@ -26,7 +27,9 @@ def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     heat_price, holding_price = ca.vertsplit(p)
     M = x[0]
     Q = u[1]
-    return heat_price * Q + holding_price * M
+    heating = heat_price * Q
+    holding = holding_price * M
+    return heating + holding
 
 
 def model() -> Model:

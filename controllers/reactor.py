@@ -24,16 +24,24 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     cA, T = ca.vertsplit(x)
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
-    k = by_name(PARAMETERS, p)
+    parameter = by_name(PARAMETERS, p)
+    V = parameter["V"]
+    k0 = parameter["k0"]
+    E = parameter["E"]
+    heat = parameter["heat"]
+    UA = parameter["UA"]
 
     # Arrhenius' law, first order in A.
-    rate = k["k0"] * ca.exp(-k["E"] / T) * cA
-    fed = q / k["V"] * (cAf - cA)
-    heated_by_feed = q / k["V"] * (Tf - T)
-    heated_by_reaction = k["heat"] * rate
-    heated_by_jacket = k["UA"] * (Tc - T)
+    rate = k0 * ca.exp(-E / T) * cA
+    # Balance of A: the feed brings it, the product takes it, the reaction consumes it.
+    fed = q / V * (cAf - cA)
+    consumed = rate
+    # Balance of heat, over the heat capacity of the content: each term is in K/min.
+    heated_by_feed = q / V * (Tf - T)
+    heated_by_reaction = heat * rate
+    heated_by_jacket = UA * (Tc - T)
     return ca.vertcat(
-        fed - rate,
+        fed - consumed,
         heated_by_feed + heated_by_reaction + heated_by_jacket,
     )
 
@@ -43,12 +51,17 @@ def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     cA = x[0]
     q, Tc = ca.vertsplit(u)
     cAf, Tf = ca.vertsplit(d)
-    k = by_name(PARAMETERS, p)
-    feed = k["feed_price"] * q * cAf
+    parameter = by_name(PARAMETERS, p)
+    fixed_cost = parameter["fixed_cost"]
+    feed_price = parameter["feed_price"]
+    pump_price = parameter["pump_price"]
+    cooling_price = parameter["cooling_price"]
+    feed = feed_price * q * cAf
+    # The product's price is the unit of the cost.
     product = q * (cAf - cA)
-    pumping = k["pump_price"] * q**2
-    cooling = k["cooling_price"] * (Tf - Tc) ** 2
-    return k["fixed_cost"] + feed - product + (pumping + cooling)
+    pumping = pump_price * q**2
+    cooling = cooling_price * (Tf - Tc) ** 2
+    return fixed_cost + feed - product + (pumping + cooling)
 
 
 def model() -> Model:

@@ -19,21 +19,29 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     # Torricelli's law; the least level keeps the root differentiable in an empty tank.
     level = ca.fmax(x, 1e-3)
     out = holes * ca.sqrt(2 * GRAVITY * level)
+    out3 = out[2]
+    out4 = out[3]
     # Each pump feeds a lower tank and, crosswise, the upper one over the other lower tank.
     pump1 = k1 * u[0]
     pump2 = k2 * u[1]
+    to_lower1 = split1 * pump1
+    to_lower2 = split2 * pump2
+    to_upper3 = (1 - split2) * pump2
+    to_upper4 = (1 - split1) * pump1
+    # An upper tank drains into the lower one below it.
     inflow = ca.vertcat(
-        out[2] + split1 * pump1 - d[0],
-        out[3] + split2 * pump2 - d[1],
-        (1 - split2) * pump2,
-        (1 - split1) * pump1,
+        out3 + to_lower1 - d[0],
+        out4 + to_lower2 - d[1],
+        to_upper3,
+        to_upper4,
     )
     return (inflow - out) / areas
 
 
 def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     """The squares of the pumps' voltages."""
-    return u[0] ** 2 + u[1] ** 2
+    v1, v2 = ca.vertsplit(u)
+    return v1**2 + v2**2
 
 
 def model() -> Model:

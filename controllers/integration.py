@@ -67,10 +67,12 @@ class _Predictor:
         model = problem.model
         x, u, d, p = model.symbols()
         rate = model.ode(x, u, d, p)
-        jacobian = ca.jacobian(rate, ca.vertcat(x, u))
+        point = ca.vertcat(x, u)
+        jacobian = ca.jacobian(rate, point)
         slope = ca.vec(jacobian)
         results = [ca.densify(rate), ca.densify(slope)]
         rates = ca.Function("rates", [x, u, d, p], results)
+        # The nominal d and p are the same at all points.
         nominal_d = ca.SX(ca.DM(model.nominal_disturbance))
         nominal_p = ca.SX(ca.DM(model.nominal_parameters))
         at_nominal: Any = rates(x, u, nominal_d, nominal_p)
@@ -115,7 +117,9 @@ class _Predictor:
         count, n = x.shape
         m = u.shape[1]
         # The action is held: its own derivative by (x, u) is (0, I).
-        held_jacobian = np.hstack([np.zeros((m, n)), np.eye(m)])
+        by_state_of_held = np.zeros((m, n))
+        by_action_of_held = np.eye(m)
+        held_jacobian = np.hstack([by_state_of_held, by_action_of_held])
         # A state and its derivatives side by side, which the variational equation carries on.
         state = np.zeros((count, n, 1 + n + m))
         state[:, :, 0] = x
@@ -128,7 +132,9 @@ class _Predictor:
             value, slope = self.slopes(present_x, u)
             by_state = slope[:, :, :n]
             by_action = slope[:, :, n:]
-            variation = by_state @ jacobian + by_action @ held_jacobian
+            from_state = by_state @ jacobian
+            from_action = by_action @ held_jacobian
+            variation = from_state + from_action
             column = value[:, :, None]
             return np.concatenate([column, variation], axis=2)
 
@@ -137,7 +143,8 @@ class _Predictor:
             k2 = rate(state + h / 2 * k1)
             k3 = rate(state + h / 2 * k2)
             k4 = rate(state + h * k3)
-            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            slopes = k1 + 2 * k2 + 2 * k3 + k4
+            state = state + h / 6 * slopes
         return state
 
 
@@ -218,8 +225,10 @@ def _points(problem: Problem) -> Matrix:
     upper = problem.upper
     reference = problem.reference
     # The number of corners doubles with each state and action.
-    if 2 ** len(lower) <= MAX_CORNERS:
-        corners = list(product(*zip(lower, upper, strict=True)))
+    n_corners = 2 ** len(lower)
+    if n_corners <= MAX_CORNERS:
+        bounds = zip(lower, upper, strict=True)
+        corners = list(product(*bounds))
     else:
         corners = []
         for i in range(len(lower)):
@@ -249,7 +258,8 @@ def _errors(
     errors = np.where(np.isfinite(errors), errors, np.inf)
     without_finer = np.where(grows, np.inf, 0.0)
     finite = _finite(finer)
-    return np.asarray(np.where(finite[:, None], errors, without_finer[:, None]))
+    by_state = np.where(finite[:, None], errors, without_finer[:, None])
+    return np.asarray(by_state)
 
 
 def _finite(values: Matrix) -> Mask:

@@ -36,11 +36,19 @@ class Memory:
             x: states, (n,).
             d: disturbances, of which this one is the draw w, (n_d,).
         """
+        # With this gain the filter's value has the variance of the draws.
         gain = sqrt(1.0 - self.phi**2)
-        return self.phi * x[self.state] + gain * d[self.disturbance]
+        xi = x[self.state]
+        draw = d[self.disturbance]
+        return self.phi * xi + gain * draw
 
 
-def remember(model: Model, memory: Memory, nominal: float, spread: float) -> Model:
+def remember(
+    model: Model,
+    memory: Memory,
+    nominal: float,
+    spread: float,
+) -> Model:
     """The model with the filter's value as its last state, and the draw as the disturbance.
 
     Its `ode` holds ξ: that changes at the end of a sample alone, by `Memory.next_value`.
@@ -61,18 +69,21 @@ def remember(model: Model, memory: Memory, nominal: float, spread: float) -> Mod
 
     def ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
         of_model = x[:-1]
-        rate = model.ode(of_model, u, realised(x, d), p)
+        disturbances = realised(x, d)
+        rate = model.ode(of_model, u, disturbances, p)
         # ξ is held within a sample.
         return ca.vertcat(rate, 0)
 
     def economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
         of_model = x[:-1]
-        return model.economic_cost(of_model, u, realised(x, d), p)
+        disturbances = realised(x, d)
+        return model.economic_cost(of_model, u, disturbances, p)
 
     name = model.disturbances[memory.disturbance].name
+    filtered_value = Quantity(f"memory of {name}", "1")
     return Model(
         name=f"{model.name} with a memory of {name}",
-        states=(*model.states, Quantity(f"memory of {name}", "1")),
+        states=(*model.states, filtered_value),
         actions=model.actions,
         disturbances=model.disturbances,
         parameters=model.parameters,

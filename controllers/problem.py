@@ -29,8 +29,14 @@ from cosim.core.scenario import Penalty, Scenario
 from fmus.states import continuous_states, time_constants
 
 VECTORS = (
-    *("state_lower", "state_upper", "action_lower", "action_upper"),
-    *("penalty_linear", "penalty_quadratic", "reference_state", "reference_action"),
+    "state_lower",
+    "state_upper",
+    "action_lower",
+    "action_upper",
+    "penalty_linear",
+    "penalty_quadratic",
+    "reference_state",
+    "reference_action",
 )
 """A problem's vectors, by state but for the actions'."""
 ACTIVE_SHARE = 1e-6
@@ -63,7 +69,8 @@ class Units:
         cost = 1.0
         if sizes:  # the first one is what the cost is counted in
             first = next(iter(sizes.values()))
-            power_above = np.floor(_power(first)) + 1
+            power_below = np.floor(_power(first))
+            power_above = power_below + 1
             cost = float(10.0**power_above)
         return cls(
             state=both[:n],
@@ -80,9 +87,11 @@ class Units:
         largest = self.largest_multiplier
         if not largest:
             return 1e-3 * self.cost / self.state
-        second_power = np.floor(_power(largest)) - 1
-        digit = 10.0**second_power
-        rounded_up = (np.floor(largest / digit) + 1) * digit
+        # A step of the second digit more than what two digits hold: above it in any case.
+        first_power = np.floor(_power(largest))
+        digit = 10.0 ** (first_power - 1)
+        two_digits = np.floor(largest / digit)
+        rounded_up = (two_digits + 1) * digit
         return np.asarray(rounded_up / self.state)
 
 
@@ -118,6 +127,7 @@ class Scale:
             sizes = _cost_sizes(problem, ranges)
         except ModelError:  # a size of the cost is wanted here, not its multipliers
             sizes = {}
+        # The sizes come in the order in which they say most.
         level = next(iter(sizes.values()), 1.0)
         # Powers of two, so that scaling rounds nothing; limits keep products of scales finite.
         range_powers = np.log2(np.clip(ranges, 1e-50, 1e50))
@@ -156,17 +166,24 @@ def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
     the multipliers cannot be computed.
     """
     n = problem.n_states
+    lower = problem.lower
+    upper = problem.upper
     reference = problem.reference
     gradient, curvature, rates = _derivatives_at_reference(problem)
-    near = ACTIVE_SHARE * (problem.upper - problem.lower)
-    below = reference <= problem.lower + near
-    above = reference >= problem.upper - near
-    bound_multipliers = multipliers(gradient * both, rates * both, below, above)
+    near = ACTIVE_SHARE * (upper - lower)
+    below = reference <= lower + near
+    above = reference >= upper - near
     # Over a step of each variable, so that all sizes are costs.
-    second_order = np.abs(curvature * both**2)
+    gradient_of_steps = gradient * both
+    rates_of_steps = rates * both
+    curvature_of_steps = np.abs(curvature * both**2)
+    bound_multipliers = multipliers(gradient_of_steps, rates_of_steps, below, above)
+    of_states = bound_multipliers[:n]
+    # A second derivative that is not finite, as of a root at zero, says nothing of the size.
+    finite_curvature = np.nan_to_num(curvature_of_steps, posinf=0.0)
     sizes = {
-        "multiplier": float(bound_multipliers[:n].max()),
-        "curvature": float(np.nan_to_num(second_order, posinf=0.0).max()),
+        "multiplier": float(of_states.max()),
+        "curvature": float(finite_curvature.max()),
         "cost": abs(problem.reference_cost),
     }
     # A size below rounding counts as zero.
@@ -182,7 +199,8 @@ def linear_model(problem: Problem) -> tuple[Matrix, Matrix]:
     x, u, d, p = model.symbols()
     f = discretise(model, problem.sampling_time, problem.substeps)
     x_next = f(x, u, d, p)
-    by_point = ca.jacobian(x_next, ca.vertcat(x, u))
+    point = ca.vertcat(x, u)
+    by_point = ca.jacobian(x_next, point)
     jacobian = ca.Function("AB", [x, u, d, p], [by_point])
     both = jacobian(*problem.nominal_point).full()
     A = both[:, :n]
@@ -198,11 +216,17 @@ def _derivatives_at_reference(problem: Problem) -> tuple[Vector, Vector, Matrix]
     w = ca.vertcat(x, u)
     cost = ca.SX(model.economic_cost(*symbols))
     hessian, gradient = ca.hessian(cost, w)
-    jacobian = ca.jacobian(model.ode(*symbols), w)
-    function = ca.Function("d", list(symbols), [gradient, ca.diag(hessian), jacobian])
-    values = function(*problem.nominal_point)
-    slope, curvature, rates = (value.full() for value in values)
-    return slope.reshape(-1), curvature.reshape(-1), rates
+    diagonal = ca.diag(hessian)
+    rate = model.ode(*symbols)
+    jacobian = ca.jacobian(rate, w)
+    function = ca.Function("d", list(symbols), [gradient, diagonal, jacobian])
+    slope, curvature, by_point = function(*problem.nominal_point)
+    # Columns of one entry a variable become vectors.
+    return (
+        slope.full().reshape(-1),
+        curvature.full().reshape(-1),
+        by_point.full(),
+    )
 
 
 def multipliers(
@@ -237,13 +261,17 @@ def multipliers(
     # An equation may be multiplied by any number: in rows of size 1 DAQP's tolerances mean what
     # they say.
     row_sizes = np.abs(rates).max(axis=1, keepdims=True)
-    rows = rates / np.maximum(row_sizes, np.finfo(np.float64).tiny)
+    row_sizes = np.maximum(row_sizes, np.finfo(np.float64).tiny)
+    rows = rates / row_sizes
 
     # DAQP's limits are those of the variables, then those of the rows, which are equations.
     n_equations = len(rates)
     zeros = np.zeros(n_equations)
-    upper = np.concatenate([np.where(above, 0.0, np.inf), zeros])
-    lower = np.concatenate([np.where(below, 0.0, -np.inf), zeros])
+    # Only a bound that the reference is at holds w back, and it does from there on.
+    upper_of_w = np.where(above, 0.0, np.inf)
+    lower_of_w = np.where(below, 0.0, -np.inf)
+    upper = np.concatenate([upper_of_w, zeros])
+    lower = np.concatenate([lower_of_w, zeros])
     sense = np.zeros(n_bounds + n_equations, dtype=np.int32)
     sense[n_bounds:] = DAQP_FIXED
     _, _, flag, info = daqp.solve(
@@ -261,6 +289,7 @@ def multipliers(
             f"({DAQP_STATUS.get(flag, flag)}); look at the derivatives of cost and model there"
         )
     bound_multipliers = np.abs(info["lam"][:n_bounds])
+    # The gradient was given in units of its size.
     return np.asarray(bound_multipliers * size)
 
 
@@ -276,7 +305,8 @@ def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ModelError(f"problem: {name} holds no numbers: {values!r}") from error
-    if array.shape != (size,) or not np.isfinite(array).all():
+    usable = array.shape == (size,) and np.isfinite(array).all()
+    if not usable:
         raise ModelError(f"problem: {name} must be {size} finite numbers, not {array}")
     array.flags.writeable = False
     return array
@@ -336,7 +366,8 @@ class Problem:
     def __post_init__(self) -> None:
         for name in VECTORS:
             size = self.n_actions if "action" in name else self.n_states
-            vector = _frozen(name, getattr(self, name), size)
+            given = getattr(self, name)
+            vector = _frozen(name, given, size)
             object.__setattr__(self, name, vector)
         for kind in ("state", "action"):
             lower = getattr(self, f"{kind}_lower")
@@ -380,8 +411,10 @@ class Problem:
         rate, rates, cost, slope = (value.full() for value in values)
         quantities = (*model.states, *model.actions)
         names = [quantity.name for quantity in quantities]
+        # A value before its derivatives, which are not finite for the same reason.
         for i in range(n):
-            self._require_finite(f"ode(x, u, d, p): d/dt {names[i]}", rate[i, 0])
+            what = f"ode(x, u, d, p): d/dt {names[i]}"
+            self._require_finite(what, rate[i, 0])
         for i in range(n):
             for j, name in enumerate(names):
                 what = f"ode(x, u, d, p): the derivative of d/dt {names[i]} by {name}"
@@ -466,7 +499,8 @@ class Problem:
         # At most one of the two bounds is violated, so the larger excess is the violation.
         below = lower - s
         above = s - upper
-        violation = ca.fmax(ca.fmax(below, above), 0)
+        excess = ca.fmax(below, above)
+        violation = ca.fmax(excess, 0)
         linear = ca.dot(self.penalty_linear, violation)
         quadratic = ca.dot(self.penalty_quadratic, violation**2)
         return linear + quadratic
@@ -507,14 +541,18 @@ class Problem:
             return secrets.token_hex()
         numbers = []
         for item in fields(self):
-            if item.name not in ("model", "varying"):
-                value = np.asarray(getattr(self, item.name))
-                numbers.append((item.name, value.tolist()))
+            if item.name in ("model", "varying"):
+                continue
+            value = np.asarray(getattr(self, item.name))
+            numbers.append((item.name, value.tolist()))
         quantities = [getattr(model, kind) for kind in KINDS]
-        said = repr((model.name, quantities, model.time_unit, model.uncertain, numbers))
+        facts = (model.name, quantities, model.time_unit, model.uncertain, numbers)
+        text = repr(facts)
         if self.varying:
-            said += repr(self.varying)
-        return hashlib.sha256((said + function.serialize()).encode()).hexdigest()
+            text += repr(self.varying)
+        text += function.serialize()
+        digest = hashlib.sha256(text.encode())
+        return digest.hexdigest()
 
     def value_level(self, discount: float | None = None) -> float:
         """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.
@@ -634,6 +672,7 @@ class PlantProblem:
         law = self.law
         memory = Memory(i, problem.n_states, phi)
         model = remember(problem.model, memory, float(law.nominal[i]), float(law.ranges[i]))
+        # The draw has no unit: the model gives the filter's value nominal value and range.
         nominal = law.nominal.copy()
         ranges = law.ranges.copy()
         nominal[i] = 0.0
@@ -649,9 +688,8 @@ class PlantProblem:
             penalty_quadratic=np.append(problem.penalty_quadratic, NO_PENALTY),
             reference_state=np.append(problem.reference_state, 0.0),
         )
-        return PlantProblem(
-            larger, DisturbanceLaw(law.kind, nominal, ranges), self.parameters, memory
-        )
+        law_of_draws = DisturbanceLaw(law.kind, nominal, ranges)
+        return PlantProblem(larger, law_of_draws, self.parameters, memory)
 
     def sampled(self, substeps: int) -> ca.Function:
         """The state after a sample, a function (x, u, d, p), by so many RK4 steps."""
@@ -661,6 +699,7 @@ class PlantProblem:
             return step
         x, u, d, p = problem.model.symbols()
         next_x = step(x, u, d, p)
+        # The model holds the filter's value within a sample, at whose end it changes.
         next_x[self.memory.state] = self.memory.next_value(x, d)
         return ca.Function("sampled", [x, u, d, p], [next_x])
 
@@ -672,9 +711,11 @@ class PlantProblem:
         """
         if self.memory is None:
             return ""
-        others = np.delete(self.law.ranges, self.memory.disturbance)
         i = self.memory.disturbance
-        return self.problem.model.disturbances[i].name if others.any() else ""
+        others = np.delete(self.law.ranges, i)
+        if not others.any():
+            return ""
+        return self.problem.model.disturbances[i].name
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> PlantProblem:
@@ -728,16 +769,21 @@ class PlantProblem:
             parameters[name] = value
         values = np.array(list(parameters.values()), dtype=np.float64)
         white = cls(problem, law, values)
+        # One at most: `_require_whole_state` refuses more.
         for name, constant in filtered.items():
+            index = plant.disturbances.index(name)
             phi = exp(-problem.sampling_time / constant)
-            return white.with_memory(plant.disturbances.index(name), phi)
+            return white.with_memory(index, phi)
         return white
 
 
 def _fmu_file(scenario: Scenario) -> Path:
     """Path of the plant's FMU."""
     fmu = scenario.plant.fmu
-    return fmus.path(fmu) if fmu in (*fmus.NAMES, *fmus.PLANTS) else Path(fmu)
+    shipped = (*fmus.NAMES, *fmus.PLANTS)
+    if fmu in shipped:
+        return fmus.path(fmu)
+    return Path(fmu)
 
 
 def _filtered(scenario: Scenario) -> dict[str, float]:
@@ -751,7 +797,8 @@ def _filtered(scenario: Scenario) -> dict[str, float]:
     ranges = dict(zip(plant.disturbances, table.ranges, strict=False))
     filtered = {}
     for name, constant in constants.items():
-        if constant > 0.0 and table.law != "none" and ranges.get(name, 1.0) > 0.0:
+        varies = table.law != "none" and ranges.get(name, 1.0) > 0.0
+        if varies and constant > 0.0:
             filtered[name] = constant
     return filtered
 

@@ -91,10 +91,18 @@ def _riccati(stages: Stages) -> _Feedback:
         A = stages.A[k]
         B = stages.B[k]
         L = stages.L[k]
-        curvature = L[n:, n:] + B.T @ P @ B
-        coupling = L[n:, :n] + B.T @ P @ A
-        offset = P @ stages.r[k] + p
-        slope = stages.q[k, n:] + B.T @ offset
+        L_states = L[:n, :n]
+        L_controls = L[n:, n:]
+        L_mixed = L[n:, :n]
+        q_states = stages.q[k, :n]
+        q_controls = stages.q[k, n:]
+        r = stages.r[k]
+
+        # The cost of stage and rest in v_k, for ξ_{k+1} = A ξ_k + B v_k + r.
+        curvature = L_controls + B.T @ P @ B
+        coupling = L_mixed + B.T @ P @ A
+        offset = P @ r + p
+        slope = q_controls + B.T @ offset
         try:
             np.linalg.cholesky(curvature)
         except np.linalg.LinAlgError:
@@ -102,8 +110,9 @@ def _riccati(stages: Stages) -> _Feedback:
         R[k] = (curvature + curvature.T) / 2
         K[k] = -np.linalg.solve(curvature, coupling)
         b[k] = -np.linalg.solve(curvature, slope)
-        p = stages.q[k, :n] + A.T @ offset + coupling.T @ b[k]
-        P = L[:n, :n] + A.T @ P @ A + coupling.T @ K[k]
+        p = q_states + A.T @ offset + coupling.T @ b[k]
+        P = L_states + A.T @ P @ A + coupling.T @ K[k]
+        # Rounding takes the symmetry away, a little more each stage.
         P = (P + P.T) / 2
     return _Feedback(K, b, R)
 
@@ -122,48 +131,91 @@ def solve_stabilised(stages: Stages, xi_0: Vector) -> QpSolution:
         QpError: The QP is not convex, or not solved.
     """
     horizon, n, m = stages.B.shape
+    n_controls = horizon * m
+    n_soft = horizon * n
     feedback = _riccati(stages)
+    responses = _respond(stages, feedback, xi_0)
+    free_controls = responses.free_controls
+    free_states = responses.free_states
 
-    # States and controls as they respond to c, and without any c.
-    to_c = np.zeros((n, horizon * m))
-    free = xi_0
-    controls = np.empty((horizon, m, horizon * m))
-    free_controls = np.empty((horizon, m))
-    states = np.empty((horizon, n, horizon * m))
-    free_states = np.empty((horizon, n))
-    for k in range(horizon):
-        own = slice(k * m, (k + 1) * m)
-        controls[k] = feedback.K[k] @ to_c
-        controls[k, :, own] += np.eye(m)
-        free_controls[k] = feedback.K[k] @ free
-        to_c = stages.A[k] @ to_c + stages.B[k] @ controls[k]
-        free = stages.A[k] @ free + stages.B[k] @ free_controls[k] + stages.r[k]
-        states[k] = to_c
-        free_states[k] = free
-    control_rows = controls.reshape(horizon * m, -1)
-    state_rows = states.reshape(horizon * n, -1)
-
-    hessian = np.zeros((horizon * m, horizon * m))
+    # The recursion has completed the squares: the cost is Σ ½(c_k − b_k)ᵀ R_k (c_k − b_k).
+    hessian = np.zeros((n_controls, n_controls))
     for k in range(horizon):
         own = slice(k * m, (k + 1) * m)
         hessian[own, own] = feedback.R[k]
-    gradient = -hessian @ feedback.b.reshape(-1)
-    state_lower = np.tile(stages.state_lower, horizon) - free_states.reshape(-1)
-    state_upper = np.tile(stages.state_upper, horizon) - free_states.reshape(-1)
+    b = feedback.b.reshape(-1)
+    gradient = -hessian @ b
+
+    # The limits of v and ξ, less what these are without any c, are those of the responses.
+    control_lower = stages.lower - free_controls
+    control_upper = stages.upper - free_controls
+    state_lower = np.tile(stages.state_lower, horizon) - free_states
+    state_upper = np.tile(stages.state_upper, horizon) - free_states
     fixed = stages.lower == stages.upper
+    kinds_of_controls = fixed * DAQP_FIXED
+    kinds_of_states = np.full(n_soft, DAQP_SOFT)
     c, multipliers = _solve_daqp(
         hessian,
         gradient,
-        rows=np.vstack([control_rows, state_rows]),
-        lower=np.concatenate([stages.lower - free_controls.reshape(-1), state_lower]),
-        upper=np.concatenate([stages.upper - free_controls.reshape(-1), state_upper]),
-        sense=np.concatenate([fixed * DAQP_FIXED, np.full(horizon * n, DAQP_SOFT)]),
+        rows=np.vstack([responses.controls, responses.states]),
+        lower=np.concatenate([control_lower, state_lower]),
+        upper=np.concatenate([control_upper, state_upper]),
+        sense=np.concatenate([kinds_of_controls, kinds_of_states]),
         w=stages.w,
         W=stages.W,
     )
-    v = control_rows @ c + free_controls.reshape(-1)
-    nu = multipliers[: horizon * m]
-    return QpSolution(v, nu, multipliers[horizon * m :])
+    v = responses.controls @ c + free_controls
+    nu = multipliers[:n_controls]
+    lam = multipliers[n_controls:]
+    return QpSolution(v, nu, lam)
+
+
+@dataclass(frozen=True)
+class _Responses:
+    """Controls v_0 … v_{N−1} and states ξ_1 … ξ_N: how they respond to c, and without any c.
+
+    Attributes:
+        controls: (Nm, Nm).
+        states: (Nn, Nm).
+        free_controls: (Nm,).
+        free_states: (Nn,).
+    """
+
+    controls: Matrix
+    states: Matrix
+    free_controls: Vector
+    free_states: Vector
+
+
+def _respond(stages: Stages, feedback: _Feedback, xi_0: Vector) -> _Responses:
+    """Simulate v_k = K_k ξ_k + c_k from ξ_0, for each entry of c and for none."""
+    horizon, n, m = stages.B.shape
+    n_controls = horizon * m
+    controls = np.empty((horizon, m, n_controls))
+    states = np.empty((horizon, n, n_controls))
+    free_controls = np.empty((horizon, m))
+    free_states = np.empty((horizon, n))
+    # ξ_0 is given: no c moves it.
+    to_c = np.zeros((n, n_controls))
+    free = xi_0
+    for k in range(horizon):
+        A = stages.A[k]
+        B = stages.B[k]
+        K = feedback.K[k]
+        own = slice(k * m, (k + 1) * m)
+        controls[k] = K @ to_c
+        controls[k, :, own] += np.eye(m)
+        free_controls[k] = K @ free
+        to_c = A @ to_c + B @ controls[k]
+        free = A @ free + B @ free_controls[k] + stages.r[k]
+        states[k] = to_c
+        free_states[k] = free
+    return _Responses(
+        controls=controls.reshape(n_controls, -1),
+        states=states.reshape(horizon * n, -1),
+        free_controls=free_controls.reshape(-1),
+        free_states=free_states.reshape(-1),
+    )
 
 
 def _solve_daqp(

@@ -14,13 +14,14 @@ import numpy as np
 from controllers.errors import ModelError
 from controllers.problem import Problem
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
-from controllers.varying import of_kind
+from controllers.varying import VaryingKind, of_kind
 from cosim.core.protocols import Vector
 
 
 def given_size(problem: Problem, blocks: ThetaBlocks) -> int:
     """Entries of (θ, σ)."""
-    return blocks.size + len(problem.varying) * (problem.horizon + 1)
+    n_stages = problem.horizon + 1
+    return blocks.size + len(problem.varying) * n_stages
 
 
 def nominal_given(problem: Problem, theta: Vector) -> Vector:
@@ -31,15 +32,19 @@ def nominal_given(problem: Problem, theta: Vector) -> Vector:
         theta: θ, (n_θ,).
     """
     nominal = [item.nominal for item in problem.varying]
-    return np.concatenate([theta, np.tile(nominal, problem.horizon + 1)])
+    n_stages = problem.horizon + 1
+    sigma = np.tile(nominal, n_stages)
+    return np.concatenate([theta, sigma])
 
 
 def symbolic_given(problem: Problem, blocks: ThetaBlocks) -> Symbols:
     """`symbolic_theta` whose `theta` is (θ, σ), and `sigma` (n_σ, N+1)."""
     count = len(problem.varying)
-    symbols = symbolic_theta(problem, blocks, given_size(problem, blocks) - blocks.size)
+    n_stages = problem.horizon + 1
+    symbols = symbolic_theta(problem, blocks, count * n_stages)
     behind = symbols["theta"][blocks.size :]
-    symbols["sigma"] = ca.reshape(behind, count, problem.horizon + 1)
+    # A stage in each column, as CasADi stacks them.
+    symbols["sigma"] = ca.reshape(behind, count, n_stages)
     return symbols
 
 
@@ -53,13 +58,18 @@ def symbolic_stage(problem: Problem, blocks: ThetaBlocks) -> Symbols:
         ModelError: A varying parameter is one of θ's.
     """
     varying = problem.varying
-    symbols = symbolic_theta(problem, blocks, len(varying) + 1 if varying else 0)
-    theta = symbols["theta"]
     model = problem.model
+    # Behind θ the signals and γᵏ, which differs from stage to stage where they do.
+    n_behind = len(varying) + 1 if varying else 0
+    symbols = symbolic_theta(problem, blocks, n_behind)
+    theta = symbols["theta"]
     disturbance = ca.SX(ca.DM(model.nominal_disturbance))
     parameters = symbols["model_parameters"]
+    # θ's cost stands for the nominal prices: what a price adds is the difference from these.
     nominal_prices = ca.SX(parameters)
-    in_theta = blocks.block("p").labels if "p" in blocks else ()
+    in_theta: tuple[str, ...] = ()
+    if "p" in blocks:
+        in_theta = blocks.block("p").labels
     for row, item in of_kind(varying, "disturbance", "parameter", "price"):
         value = theta[blocks.size + row]
         if item.kind == "disturbance":
@@ -92,10 +102,15 @@ def stage_columns(problem: Problem, blocks: ThetaBlocks, given: ca.MX) -> ca.MX:
     count = len(problem.varying)
     if not count:
         return ca.repmat(given, 1, horizon)
-    theta, behind = ca.vertsplit(given, [0, blocks.size, given.numel()])
+    begins = [0, blocks.size, given.numel()]
+    theta, behind = ca.vertsplit(given, begins)
+    theta_of_stages = ca.repmat(theta, 1, horizon)
+    # The last column and the last power are those of x_N, where the horizon ends.
     sigma = ca.reshape(behind, count, horizon + 1)
-    discounts = ca.MX(ca.DM(problem.discounts[:-1]).T)
-    return ca.vertcat(ca.repmat(theta, 1, horizon), sigma[:, :-1], discounts)
+    sigma_of_stages = sigma[:, :-1]
+    discounts = ca.DM(problem.discounts[:-1])
+    row_of_discounts = ca.MX(discounts.T)
+    return ca.vertcat(theta_of_stages, sigma_of_stages, row_of_discounts)
 
 
 def state_bounds(problem: Problem, symbols: Symbols) -> tuple[list[ca.SX], list[ca.SX]]:
@@ -122,8 +137,11 @@ def true_bounds(problem: Problem, symbols: Symbols) -> tuple[ca.SX, ca.SX] | Non
     """
     if not of_kind(problem.varying, "lower", "upper"):
         return None
-    lower = _moved(problem, symbols, "lower", ca.SX(ca.DM(problem.state_lower)))
-    upper = _moved(problem, symbols, "upper", ca.SX(ca.DM(problem.state_upper)))
+    state_lower = ca.SX(ca.DM(problem.state_lower))
+    state_upper = ca.SX(ca.DM(problem.state_upper))
+    lower = _moved(problem, symbols, "lower", state_lower)
+    upper = _moved(problem, symbols, "upper", state_upper)
+    # The present state is that of stage 0.
     return lower[0], upper[0]
 
 
@@ -133,9 +151,14 @@ def moved_references(problem: Problem, symbols: Symbols) -> list[ca.SX]:
     return _moved(problem, symbols, "reference", still)
 
 
-def _moved(problem: Problem, symbols: Symbols, kind: str, start: ca.SX) -> list[ca.SX]:
+def _moved(
+    problem: Problem,
+    symbols: Symbols,
+    kind: VaryingKind,
+    start: ca.SX,
+) -> list[ca.SX]:
     """A vector at the stages 0 … N, moved by the varying quantities of a kind."""
-    moving = of_kind(problem.varying, kind)  # type: ignore[arg-type]
+    moving = of_kind(problem.varying, kind)
     n_stages = problem.horizon + 1
     if not moving:
         # One expression for all of them: its C is that of a problem where nothing varies.

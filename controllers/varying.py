@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from controllers.errors import ModelError
 from controllers.model import Model
@@ -43,22 +44,15 @@ def varying_quantities(scenario: Scenario, model: Model) -> tuple[Varying, ...]:
     """
     quantities = []
     for table in scenario.signals or ():
+        # The plant follows such a signal, and the controller hears nothing of it.
         if table.known == "none":
             continue
         if table.model is not None:
             quantities.append(_of_model(table, table.model, model))
         elif table.bound is not None:
-            index = scenario.plant.states.index(table.bounded_state)
-            if table.is_lower_bound:
-                nominal = float(scenario.state_lower[index])
-                quantities.append(Varying(table.name, "lower", index, nominal))
-            else:
-                nominal = float(scenario.state_upper[index])
-                quantities.append(Varying(table.name, "upper", index, nominal))
+            quantities.append(_bound(table, scenario))
         elif table.reference is not None:
-            index = (*scenario.plant.states, *scenario.plant.actions).index(table.reference)
-            references = (*scenario.reference_state.tolist(), *scenario.reference_action.tolist())
-            quantities.append(Varying(table.name, "reference", index, references[index]))
+            quantities.append(_reference(table, table.reference, scenario))
     return tuple(quantities)
 
 
@@ -68,23 +62,52 @@ def _of_model(table: SignalTable, name: str, model: Model) -> Varying:
     parameters = [quantity.name for quantity in model.parameters]
     if name in disturbances:
         index = disturbances.index(name)
-        return Varying(table.name, "disturbance", index, model.disturbances[index].nominal)
+        nominal = model.disturbances[index].nominal
+        return Varying(table.name, "disturbance", index, nominal)
     if name in parameters:
         index = parameters.index(name)
         kind: VaryingKind = "price" if _is_price(model, index) else "parameter"
-        return Varying(table.name, kind, index, model.parameters[index].nominal)
+        nominal = model.parameters[index].nominal
+        return Varying(table.name, kind, index, nominal)
     raise ModelError(
         f"signal '{table.name}': model '{model.name}' has no disturbance or parameter '{name}'"
         f"{instead(name, (*disturbances, *parameters))}"
     )
 
 
+def _bound(table: SignalTable, scenario: Scenario) -> Varying:
+    """The bound of a state that a signal is."""
+    index = scenario.plant.states.index(table.bounded_state)
+    kind: VaryingKind
+    if table.is_lower_bound:
+        kind = "lower"
+        bounds = scenario.state_lower
+    else:
+        kind = "upper"
+        bounds = scenario.state_upper
+    nominal = float(bounds[index])
+    return Varying(table.name, kind, index, nominal)
+
+
+def _reference(table: SignalTable, name: str, scenario: Scenario) -> Varying:
+    """The reference of a state or an action that a signal is."""
+    plant = scenario.plant
+    names = [*plant.states, *plant.actions]
+    index = names.index(name)
+    references = np.concatenate([scenario.reference_state, scenario.reference_action])
+    nominal = float(references[index])
+    return Varying(table.name, "reference", index, nominal)
+
+
 def _is_price(model: Model, index: int) -> bool:
     """Whether a parameter is in the economic cost and not in the dynamics."""
     symbols = model.symbols()
-    parameter = symbols[3][index]
-    in_dynamics = ca.depends_on(ca.SX(model.ode(*symbols)), parameter)
-    in_cost = ca.depends_on(ca.SX(model.economic_cost(*symbols)), parameter)
+    *_, p = symbols
+    parameter = p[index]
+    rates = ca.SX(model.ode(*symbols))
+    cost = ca.SX(model.economic_cost(*symbols))
+    in_dynamics = ca.depends_on(rates, parameter)
+    in_cost = ca.depends_on(cost, parameter)
     return bool(in_cost and not in_dynamics)
 
 

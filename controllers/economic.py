@@ -64,16 +64,18 @@ class SteadyState:
         sentences = []
         multipliers = np.abs(self.C @ self.multipliers)
         for row, bound, multiplier in zip(self.C, self.active, multipliers, strict=True):
-            unit = self.units[int(np.argmax(row))]
+            # A row of C is the unit vector of the variable that the bound is of.
+            variable = int(np.argmax(row))
+            unit = self.units[variable]
             word = UNIT_WORDS.get(unit, unit)
             sentences.append(f"{bound} costs {multiplier:.3g} a {word}, each sample")
         return tuple(sentences)
 
     def __str__(self) -> str:
-        return (
-            f"optimal steady state: x = {_five_digits(self.x)}, u = {_five_digits(self.u)}, "
-            f"cost {self.cost:.6g}, active: {', '.join(self.active) or 'no bound'}"
-        )
+        x = _five_digits(self.x)
+        u = _five_digits(self.u)
+        active = ", ".join(self.active) or "no bound"
+        return f"optimal steady state: x = {x}, u = {u}, cost {self.cost:.6g}, active: {active}"
 
 
 def optimal_steady_state(problem: Problem) -> SteadyState:
@@ -135,6 +137,8 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     least = STRICTLY_ACTIVE * max(1.0, size.max())
     strict = np.flatnonzero(size > least)
     active = [_active_bound(problem, i, multipliers[i]) for i in strict.tolist()]
+    units = [quantity.unit for quantity in (*model.states, *model.actions)]
+    gradients = np.eye(len(point))
     return SteadyState(
         x=point[:n],
         u=point[n:],
@@ -144,9 +148,9 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         A=jacobian[:, :n],
         B=jacobian[:, n:],
         hessian=hessian,
-        C=np.eye(len(point))[strict],
+        C=gradients[strict],
         active=tuple(active),
-        units=tuple(quantity.unit for quantity in (*model.states, *model.actions)),
+        units=tuple(units),
     )
 
 
@@ -156,6 +160,7 @@ def _active_bound(problem: Problem, i: int, multiplier: float) -> str:
     quantities = (*model.states, *model.actions)
     quantity = quantities[i]
     size = abs(multiplier)
+    # Bounds of states are soft: where a bound costs more than its violation, none is kept.
     if i < problem.n_states and size >= problem.penalty_linear[i]:
         raise TuningError(
             f"the penalty of {quantity.name} is too small: its linear weight "
@@ -191,9 +196,11 @@ def local_feedback(
     """
     n, m = B.shape
     # What a state's constraint asks of the next state, as a constraint of (x, u).
-    on_action = np.abs(C[:, n:]).max(axis=1, initial=0.0) > 0
     dynamics = np.hstack([A, B])
-    on_next_state = C[~on_action, :n] @ dynamics
+    C_x = C[:, :n]
+    C_u = C[:, n:]
+    on_action = np.abs(C_u).max(axis=1, initial=0.0) > 0
+    on_next_state = C_x[~on_action] @ dynamics
     rows = np.vstack([C[on_action], on_next_state])
     by_state = rows[:, :n]
     by_action = rows[:, n:]
@@ -209,12 +216,15 @@ def local_feedback(
             )
         gain = -np.linalg.pinv(by_action) @ by_state
         free = null_space(by_action)
-    if free.shape[1]:
-        gain = gain + free @ _unconstrained_feedback(A, B, H, gain, free)
+    n_free = free.shape[1]
+    if n_free:
+        free_gain = _unconstrained_feedback(A, B, H, gain, free)
+        gain = gain + free @ free_gain
 
     closed_loop = A + B @ gain
     eigenvalues = np.linalg.eigvals(closed_loop)
-    if np.abs(eigenvalues).max() >= 1:
+    spectral_radius = np.abs(eigenvalues).max()
+    if spectral_radius >= 1:
         raise TuningError("the active constraints, once kept, make the closed loop unstable")
     # P = stage + closedᵀ P closed: the Riccati solver's P is accurate in the gain's part only.
     along = np.vstack([np.eye(n), gain])
@@ -235,7 +245,8 @@ def _unconstrained_feedback(
     count = free.shape[1]
     # In the free variables: (x, u) = change (x, v).
     state_rows = [np.eye(n), np.zeros((n, count))]
-    change = np.block([state_rows, [gain, free]])
+    action_rows = [gain, free]
+    change = np.block([state_rows, action_rows])
     reduced = change.T @ H @ change
     a = A + B @ gain
     b = B @ free
@@ -248,6 +259,7 @@ def _unconstrained_feedback(
         raise TuningError(
             f"the steady state has no stabilising local feedback of finite cost ({error})"
         ) from error
+    # H may be indefinite, and then the equation has solutions that are no minimum.
     curvature = r + b.T @ P @ b
     eigenvalues = np.linalg.eigvalsh(_symmetric(curvature))
     if eigenvalues.min() <= 0:
@@ -519,14 +531,21 @@ def _scaled_cost(steady: SteadyState, ranges: Array) -> tuple[Array, float]:
     The size is that of the gradient, which is all that a linear cost has, or of the curvature.
     """
     H = steady.hessian * np.outer(ranges, ranges)
+    curvature = np.abs(H).max()
+
     # The gradient by stationarity: the multipliers of the bounds, and those of x₊ = x.
-    identity = np.eye(len(steady.x))
-    drift = np.hstack([steady.A - identity, steady.B])
+    n = len(steady.x)
+    by_state = steady.A - np.eye(n)
+    by_action = steady.B
+    drift = np.hstack([by_state, by_action])
     gradient = steady.multipliers - drift.T @ steady.costate
     slope = np.abs(gradient * ranges).max()
-    curvature = np.abs(H).max()
-    size = max(slope, curvature)
-    return H, float(size) or 1.0
+
+    size = float(max(slope, curvature))
+    # A cost that is constant has no size; it is in its own unit.
+    if size == 0.0:
+        size = 1.0
+    return H, size
 
 
 def _local_tuning(problem: Problem, steady: SteadyState) -> LocalTuning:
@@ -534,8 +553,10 @@ def _local_tuning(problem: Problem, steady: SteadyState) -> LocalTuning:
     A = steady.A
     B = steady.B
     C = steady.C
-    H, size = _scaled_cost(steady, Scale.from_problem(problem).ranges)
-    if np.abs(H).max() < LINEAR * size:
+    ranges = Scale.from_problem(problem).ranges
+    scaled_H, size = _scaled_cost(steady, ranges)
+    curvature = np.abs(scaled_H).max()
+    if curvature < LINEAR * size:
         # αH is zero: nothing determines α, and the solver's rounding would be the cost's size.
         raise TuningError("the cost is linear, so that no curvature says how to come back to it")
     # The economic cost's feedback is what the tuned one must equal: the certificate.
@@ -569,16 +590,20 @@ def _augmented_tuning(problem: Problem, steady: SteadyState, reason: str) -> Loc
     augmented = H + sigma * np.eye(len(H))
     # Half of the curvature leaves the conditioning some room.
     least = 0.5 * LEAST_CURVATURE * size
-    scaled = convexify(A, B, augmented / least, C, alpha=1.0)
-    economic, _ = local_feedback(A, B, augmented / least, C)
+    in_units_of_least = augmented / least
+    scaled = convexify(A, B, in_units_of_least, C, alpha=1.0)
+    economic, _ = local_feedback(A, B, in_units_of_least, C)
     tuned, P = local_feedback(A, B, scaled.hessian, C)
 
     # Back into the units of the problem.
-    force_scale = C @ ranges
+    force_range = C @ ranges
+    w_scale = np.outer(ranges, ranges)
+    x_scale = np.outer(x_range, x_range)
+    force_scale = np.outer(force_range, force_range)
     convex = Convexification(
-        hessian=least * scaled.hessian / np.outer(ranges, ranges),
-        delta_P=least * scaled.delta_P / np.outer(x_range, x_range),
-        F=least * scaled.F / np.outer(force_scale, force_scale),
+        hessian=least * scaled.hessian / w_scale,
+        delta_P=least * scaled.delta_P / x_scale,
+        F=least * scaled.F / force_scale,
         alpha=scaled.alpha,
         beta=scaled.beta,
     )
@@ -588,7 +613,7 @@ def _augmented_tuning(problem: Problem, steady: SteadyState, reason: str) -> Loc
         constraints=C,
         economic=economic * gain_scale,
         tuned=tuned * gain_scale,
-        value=least * P / np.outer(x_range, x_range),
+        value=least * P / x_scale,
         addition=Addition(sigma, ranges, C, released, reason),
     )
 
@@ -604,8 +629,11 @@ def _keepable_constraints(
     The bound with the least price over its range is given up first. Raises TuningError where the
     actions do not stabilise the plant at all.
     """
-    prices = np.abs(steady.C @ (steady.multipliers * ranges))
-    order = [int(i) for i in np.argsort(-prices, kind="stable")]
+    multipliers_of_ranges = steady.multipliers * ranges
+    prices = np.abs(steady.C @ multipliers_of_ranges)
+    dearest_first = np.argsort(-prices, kind="stable")
+    order = [int(i) for i in dearest_first]
+    # Any convex cost shows whether a stable feedback keeps the bounds.
     identity = np.eye(len(ranges))
     for count in range(len(order), -1, -1):
         kept = sorted(order[:count])
@@ -615,8 +643,8 @@ def _keepable_constraints(
             if count == 0:
                 raise
             continue
-        released = sorted(order[count:])
-        return steady.C[kept], tuple(steady.active[i] for i in released)
+        released = [steady.active[i] for i in sorted(order[count:])]
+        return steady.C[kept], tuple(released)
     raise AssertionError("the loop ends by a return or an error")
 
 
@@ -697,6 +725,7 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     n = problem.n_states
     convex = local.convexification
     P = local.value
+    # P is the value under γ = 1: what γ < 1 takes of the next state's, the stage cost has too.
     dynamics = np.hstack([steady.A, steady.B])
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
     q = steady.multipliers
@@ -742,8 +771,13 @@ def linearisation_substeps(problem: Problem) -> int:
     m = problem.n_actions
     x, u, d, p = model.symbols()
     h = ca.SX.sym("h")
-    after = runge_kutta(lambda state: model.ode(state, u, d, p), x, h, 1)
-    by_point = ca.jacobian(after, ca.vertcat(x, u))
+
+    def rate(state: ca.SX) -> ca.SX:
+        return model.ode(state, u, d, p)
+
+    after = runge_kutta(rate, x, h, 1)
+    point = ca.vertcat(x, u)
+    by_point = ca.jacobian(after, point)
     step = ca.Function("step", [x, u, d, p, h], [after, by_point])
     state, *held = problem.nominal_point
     length = problem.sampling_time / model.time_unit
@@ -755,9 +789,12 @@ def linearisation_substeps(problem: Problem) -> int:
         # The action is held: its own derivative stays (0, I).
         held_jacobian = np.eye(m, n + m, n)
         for _ in range(substeps):
-            results = step(present, *held, length / substeps)
-            present, slope = (part.full() for part in results)
-            jacobian = slope @ np.vstack([jacobian, held_jacobian])
+            after_step, by_step = step(present, *held, length / substeps)
+            present = after_step.full()
+            slope = by_step.full()
+            # The chain rule: what a step makes of the derivatives of its own start.
+            of_start = np.vstack([jacobian, held_jacobian])
+            jacobian = slope @ of_start
         return jacobian
 
     substeps = problem.substeps
@@ -798,8 +835,12 @@ def _five_digits(array: NDArray[np.floating[Any]]) -> str:
     """Entries to five digits, on one line."""
     rows = []
     for row in array:
-        rows.append(_five_digits(row) if row.ndim else f"{float(row):.5g}")
-    return f"[{', '.join(rows)}]"
+        if row.ndim:
+            rows.append(_five_digits(row))
+        else:
+            rows.append(f"{float(row):.5g}")
+    joined = ", ".join(rows)
+    return f"[{joined}]"
 
 
 def solve_conic(
@@ -828,10 +869,12 @@ def solve_conic(
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_iter = iterations
+    quadratic = sparse.csc_matrix(np.triu(P))
+    constraints = sparse.csc_matrix(A)
     solver = clarabel.DefaultSolver(
-        sparse.csc_matrix(np.triu(P)),
+        quadratic,
         q,
-        sparse.csc_matrix(A),
+        constraints,
         b,
         list(cones),
         settings,

@@ -49,8 +49,10 @@ class Lqr:
             return Decision(a)
         problem = self.problem
         deviation = s - problem.reference_state
-        u = problem.reference_action - self.gain @ deviation
-        return Decision(np.clip(u, problem.action_lower, problem.action_upper))
+        correction = self.gain @ deviation
+        u = problem.reference_action - correction
+        action = np.clip(u, problem.action_lower, problem.action_upper)
+        return Decision(action)
 
 
 class PiLoops:
@@ -67,12 +69,14 @@ class PiLoops:
         A, B = linear_model(problem)
         self.problem = problem
         self.states = pairing(B)
+        # A sample's own dynamics of a state, the others held, are its entry of A's diagonal.
         # The clip gives an integrator a long time constant, and a state without memory a short one.
         poles = np.clip(np.diag(A), 1e-9, 1.0 - 1e-9)
         pole = poles[self.states]
         time_constant = -1.0 / np.log(pole)
         # K = τ/k with the steady gain k of an action, that of a sample over 1 − pole.
-        actions = np.arange(len(B))
+        n_actions = len(self.states)
+        actions = np.arange(n_actions)
         sample_gain = B[self.states, actions]
         self.gain = time_constant * (1.0 - pole) / sample_gain
         self.reset_time = np.minimum(time_constant, 4.0)
@@ -119,7 +123,8 @@ def pairing(gains: Array) -> NDArray[np.intp]:
     """
     try:
         inverse = np.linalg.inv(gains)
-        relative = (gains * inverse.T).T
+        by_state = gains * inverse.T
+        relative = by_state.T
     except np.linalg.LinAlgError:  # not square, or singular
         relative = np.zeros_like(gains.T)
     distance = np.abs(relative - 1.0)

@@ -35,9 +35,10 @@ class PolicyTable:
         # A cell's corners, and how far each one's row is behind that of the first.
         self._corners = []
         shape = [len(axis) for axis in axes]
-        for corner in itertools.product((0, 1), repeat=len(shape)):
-            offset = int(np.ravel_multi_index(corner, shape))
-            self._corners.append((corner, offset))
+        n_states = len(shape)
+        for corner in itertools.product((0, 1), repeat=n_states):
+            offset = np.ravel_multi_index(corner, shape)
+            self._corners.append((corner, int(offset)))
 
     def look_up(self, state: list[float]) -> tuple[list[float], bool]:
         """Interpolate at a state; in plain Python that takes a tenth of NumPy's time.
@@ -64,7 +65,8 @@ class PolicyTable:
                 clamped = True
             base = base * len(axis) + cell
             fractions.append(fraction)
-        row = [0.0] * len(self._rows[0])
+        n_entries = len(self._rows[0])
+        row = [0.0] * n_entries
         for corner, offset in self._corners:
             weight = 1.0
             for fraction, high in zip(fractions, corner, strict=True):

@@ -41,11 +41,19 @@ def built_once(
 
     @lru_cache(maxsize=KEPT)
     def kept(call: _Call) -> Built:
-        return build(call.problem, *call.arguments, **dict(call.options))  # type: ignore[arg-type]
+        options = dict(call.options)
+        return build(call.problem, *call.arguments, **options)  # type: ignore[arg-type]
 
     @wraps(build)
-    def find(problem: Problem, /, *arguments: P.args, **options: P.kwargs) -> Built:
-        call = _Call(problem.content, arguments, tuple(options.items()), problem)
+    def find(
+        problem: Problem,
+        /,
+        *arguments: P.args,
+        **options: P.kwargs,
+    ) -> Built:
+        # A dictionary has no hash, which the cache looks a call up by.
+        hashable_options = tuple(options.items())
+        call = _Call(problem.content, arguments, hashable_options, problem)
         return kept(call)
 
     return find

@@ -51,7 +51,8 @@ def gauss_rule(
             x, w = np.polynomial.hermite_e.hermegauss(count)
         axes.append(nominal + spread * x)
         probabilities = w / w.sum()
-        weights = np.multiply.outer(weights, probabilities).reshape(-1)
+        product = np.multiply.outer(weights, probabilities)
+        weights = product.reshape(-1)
     return axes, weights
 
 
@@ -67,9 +68,13 @@ class Refinement:
         for nodes, targets in zip(coarse, fine, strict=True):
             matrices.append(_lagrange_matrix(nodes, targets))
         # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
-        while len(matrices) > 1 and matrices[-1].shape[1] < 4:
+        while len(matrices) > 1:
+            _, n_coarse = matrices[-1].shape
+            if n_coarse >= 4:
+                break
             last = matrices.pop()
-            joined = np.kron(matrices.pop(), last)
+            last_but_one = matrices.pop()
+            joined = np.kron(last_but_one, last)
             matrices.append(joined.astype(np.float64))
         self._matrices = matrices
 
@@ -79,10 +84,13 @@ class Refinement:
         n_fine = 1  # size of the axes that are fine already, the last ones
         for matrix in reversed(self._matrices):
             fine, coarse = matrix.shape
+            # One large product where the axis is the last, else one for each row of the others.
             if n_fine == 1:
-                values = values.reshape(count, -1, coarse) @ matrix.T
+                rows = values.reshape(count, -1, coarse)
+                values = rows @ matrix.T
             else:
-                values = matrix @ values.reshape(-1, coarse, n_fine)
+                columns = values.reshape(-1, coarse, n_fine)
+                values = matrix @ columns
             n_fine *= fine
         return values.reshape(count, -1)
 
@@ -90,8 +98,10 @@ class Refinement:
 def _lagrange_matrix(nodes: Array, targets: Array) -> Array:
     """Values at the targets (t,) of the Lagrange polynomials of the nodes (q,), shape (t, q)."""
     count = len(nodes)
+    pairs = itertools.permutations(range(count), 2)
     matrix = np.ones((len(targets), count))
-    for j, k in itertools.permutations(range(count), 2):
+    # The polynomial of node j has a factor for each other node k, at which it is zero.
+    for j, k in pairs:
         width = nodes[j] - nodes[k]
         distance = targets - nodes[k]
         matrix[:, j] *= distance / width
@@ -171,7 +181,8 @@ class Elementwise:
     def __init__(self, function: ca.Function) -> None:
         self._n_work = function.sz_w()
         self._n_out = function.size1_out(0)
-        self._out_rows = list(function.sparsity_out(0).row())
+        sparsity = function.sparsity_out(0)
+        self._out_rows = list(sparsity.row())
         self._program: list[Instruction] = []
         # CasADi's own program, which is run on a work vector of arrays in place of numbers.
         evaluated = (ca.OP_INPUT, ca.OP_OUTPUT, *_OPERATIONS)
@@ -260,7 +271,8 @@ class BellmanOperator:
         model = problem.model
         law = plant.law
         self.problem = problem
-        self.deterministic = law.kind == "none" or not law.ranges.any()
+        varies = law.kind != "none" and law.ranges.any()
+        self.deterministic = not varies
         self.accuracy = accuracy
         self._step = Elementwise(plant.sampled(accuracy.substeps))
         self._cost = Elementwise(economic_cost(model))
@@ -270,6 +282,7 @@ class BellmanOperator:
         nodes, self._weights = gauss_rule(law, accuracy.nodes)
         mesh = np.meshgrid(*nodes, indexing="ij")
         self._disturbance = [values.reshape(1, -1) for values in mesh]
+        # The penalty has a kink, which many nodes must resolve; the smooth parts need few.
         penalty_nodes, self._penalty_weights = gauss_rule(law, accuracy.penalty_nodes)
         self._refine = Refinement(nodes, penalty_nodes)
         self._pool = None
@@ -286,7 +299,10 @@ class BellmanOperator:
         Returns:
             One deviation a state, (n,).
         """
-        _, x_next = self._expected_cost(state[None, :], action[None, :])
+        states = state[None, :]
+        actions = action[None, :]
+        _, x_next = self._expected_cost(states, actions)
+        # A row for each state, with a column for each node.
         x = np.concatenate(x_next)
         mean = x @ self._weights
         square = x * x
@@ -314,7 +330,9 @@ class BellmanOperator:
         smooth = grid.interpolant(W)
 
         def values_of(part: slice) -> Array:
-            cost, x_next = self._expected_cost(states[part], actions[part])
+            states_of_part = states[part]
+            actions_of_part = actions[part]
+            cost, x_next = self._expected_cost(states_of_part, actions_of_part)
             value_to_go = smooth(x_next)
             return cost + _mean(value_to_go, self._weights)
 
@@ -339,10 +357,12 @@ class BellmanOperator:
 
         def rows_of(part: slice) -> tuple[sparse.csr_array, Array]:
             states = grid.points[part]
-            cost, x_next = self._expected_cost(states, actions[part])
+            actions_of_part = actions[part]
+            cost, x_next = self._expected_cost(states, actions_of_part)
             count, n_nodes = x_next[0].shape
             shape = (count, grid.size)
-            rows = np.repeat(np.arange(count), n_nodes)
+            row_numbers = np.arange(count)
+            rows = np.repeat(row_numbers, n_nodes)
             # From state b to each corner of the cell that node q leads to: its probability times
             # the corner's weight. Entries of the same place add up.
             matrix = sparse.csr_array(shape)
@@ -350,7 +370,8 @@ class BellmanOperator:
                 probabilities = weight * self._weights
                 entries = probabilities.reshape(-1)
                 columns = index.reshape(-1)
-                matrix += sparse.csr_array((entries, (rows, columns)), shape=shape)
+                places = (rows, columns)
+                matrix += sparse.csr_array((entries, places), shape=shape)
             return matrix, cost
 
         parts = self._map(rows_of, grid.size)
@@ -377,7 +398,8 @@ class BellmanOperator:
         (stage_cost,) = self._cost(*arguments)
         at_nodes = np.broadcast_to(stage_cost, shape)
         cost = _mean(at_nodes, self._weights)
-        return cost + self._expected_penalty(x_next), x_next
+        penalty = self._expected_penalty(x_next)
+        return cost + penalty, x_next
 
     def _expected_penalty(self, x_next: Sequence[Array]) -> Array:
         """E[penalty(s₊)], shape (B,), of s₊ at the nodes, n arrays (B, q)."""
@@ -412,7 +434,8 @@ class BellmanOperator:
         bounds = problem.state_upper if sign > 0 else problem.state_lower
         linear = problem.penalty_linear[i]
         quadratic = problem.penalty_quadratic[i]
-        beyond = self._refine(x) - bounds[i]
+        at_penalty_nodes = self._refine(x)
+        beyond = at_penalty_nodes - bounds[i]
         # `Penalty` of the scenario, for one bound.
         violation = np.maximum(sign * beyond, 0.0)
         price = linear + quadratic * violation
@@ -460,15 +483,14 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     # Points (count, n), (count, m) and (count, n_d) that the closed loop may visit.
     generator = np.random.default_rng(0)
     count = 2000
-    reach = 0.25 * (state_upper - state_lower)
+    size_of_x = (count, problem.n_states)
+    size_of_u = (count, problem.n_actions)
+    span = state_upper - state_lower
+    reach = 0.25 * span
     lower = np.maximum(state_lower, reference - reach)
     upper = np.minimum(state_upper, reference + reach)
-    x = generator.uniform(lower, upper, (count, problem.n_states))
-    u = generator.uniform(
-        problem.action_lower,
-        problem.action_upper,
-        (count, problem.n_actions),
-    )
+    x = generator.uniform(lower, upper, size_of_x)
+    u = generator.uniform(problem.action_lower, problem.action_upper, size_of_u)
     d = plant.law.draw(generator, count)
     allowed = tolerance * (1 + np.abs(x))
 
@@ -478,6 +500,7 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
         # A step that is too long may overflow; then the next one is tried.
         with np.errstate(all="ignore"):
             entries = step(x.T, u.T, d.T, plant.parameters)
+            # A state that depends on no other may be one number.
             columns = [np.broadcast_to(entry, count) for entry in entries]
             x_next = np.stack(columns, axis=1)
             change = np.abs(x_next - before)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cosim.core.protocols import Array
 
 Indices = NDArray[np.intp]
+Interval = tuple[float, float]
 CUBIC_POINTS = 4
 """Points of an axis that a cubic goes through."""
 
@@ -26,7 +27,7 @@ class AxisInterpolant:
     than four points within leave all linear.
     """
 
-    def __init__(self, axis: Array, smooth: tuple[float, float] | None) -> None:
+    def __init__(self, axis: Array, smooth: Interval | None) -> None:
         n_points = len(axis)
         n_cells = n_points - 1
         cubic = _cells_within(axis, smooth)
@@ -38,17 +39,22 @@ class AxisInterpolant:
         first = np.clip(centred, 0, n_points - stencil_size)
         if any_cubic:
             cubic_cells = np.flatnonzero(cubic)
-            last_first = cubic_cells[-1] + 2 - CUBIC_POINTS
-            first[cubic] = np.clip(first[cubic], cubic_cells[0], last_first)
+            # Cell c lies between the points c and c + 1.
+            least_first = cubic_cells[0]
+            last_point = cubic_cells[-1] + 1
+            largest_first = last_point + 1 - CUBIC_POINTS
+            first[cubic] = np.clip(first[cubic], least_first, largest_first)
 
         weights = np.zeros((stencil_size, stencil_size, n_cells))
         for c in range(n_cells):
             begin = first[c]
+            origin = axis[c]
             points = range(c, c + 2)
             if any_cubic and cubic[c]:
                 points = range(begin, begin + CUBIC_POINTS)
+            # Linear cells leave the powers and points beyond theirs at zero.
             for j in points:
-                polynomial = _lagrange_polynomial(axis, j, points, axis[c])
+                polynomial = _lagrange_polynomial(axis, j, points, origin)
                 n_powers = len(polynomial)
                 weights[:n_powers, j - begin, c] = polynomial
 
@@ -70,14 +76,19 @@ class AxisInterpolant:
         """Points of the axis by which values at x are interpolated, and their weights."""
         cell, offset = self.locate(x)
         first = self.first[cell]
+        _, stencil_size, _ = self.weights.shape
         points = []
-        for j in range(self.weights.shape[1]):
-            weight = _horner(self.weights[:, j], cell, [offset])
+        for j in range(stencil_size):
+            coefficients = self.weights[:, j]
+            weight = _horner(coefficients, cell, [offset])
             points.append((first + j, weight))
         return points
 
 
-def _cells_within(axis: Array, interval: tuple[float, float] | None) -> NDArray[np.bool_]:
+def _cells_within(
+    axis: Array,
+    interval: Interval | None,
+) -> NDArray[np.bool_]:
     """Which cells of an axis lie in an interval, up to rounding; none where it is None."""
     if interval is None:
         return np.zeros(len(axis) - 1, dtype=bool)
@@ -122,7 +133,7 @@ class Grid:
     """
 
     axes: tuple[Array, ...]
-    smooth: tuple[tuple[float, float], ...] | None = None
+    smooth: tuple[Interval, ...] | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -153,7 +164,8 @@ class Grid:
         """Grid indices and weights of interpolation at states given as one array per entry."""
         # The empty product: one corner, at index 0, of weight 1.
         origin: Indices = np.zeros((), dtype=np.intp)
-        corners: list[tuple[Indices, Array]] = [(origin, np.ones(()))]
+        one = np.ones(())
+        corners: list[tuple[Indices, Array]] = [(origin, one)]
         for interpolant, values in zip(self._interpolants, x, strict=True):
             n_points = len(interpolant.axis)
             stencil = interpolant.stencil(values)
@@ -173,10 +185,12 @@ class Grid:
         table = values.reshape(self.shape)
         for interpolant in self._interpolants:
             weights = interpolant.weights
-            steps = np.arange(weights.shape[1])
+            _, stencil_size, _ = weights.shape
+            steps = np.arange(stencil_size)
             stencil = interpolant.first + steps[:, None]
+            values_at_points = table[stencil]
             # The first axis becomes (power, cell), and both go last.
-            table = np.einsum("ijc,jc...->...ic", weights, table[stencil])
+            table = np.einsum("ijc,jc...->...ic", weights, values_at_points)
 
         # Powers first, as `_horner` reads them; the cells behind them become one axis.
         n = len(self.axes)
@@ -188,6 +202,7 @@ class Grid:
         table = np.ascontiguousarray(flat)
 
         def function(x: Sequence[Array]) -> Array:
+            # The number of the cell among all, the last axis running fastest.
             index: Indices = np.zeros((), dtype=np.intp)
             offsets = []
             for interpolant, entry in zip(self._interpolants, x, strict=True):
@@ -201,7 +216,8 @@ class Grid:
 
     @cached_property
     def _interpolants(self) -> list[AxisInterpolant]:
-        none: tuple[None, ...] = (None,) * len(self.axes)
+        n_axes = len(self.axes)
+        none: tuple[None, ...] = (None,) * n_axes
         smooth = self.smooth or none
         interpolants = []
         for axis, interval in zip(self.axes, smooth, strict=True):
@@ -238,7 +254,10 @@ def graded_axis(
         features: Where the axis is dense.
         growth: Ratio of the widths of neighbouring cells, above 1.
     """
-    pieces = [_graded_piece(lower, upper, features, growth) for lower, upper in pairwise(marks)]
+    pieces = []
+    for lower, upper in pairwise(marks):
+        piece = _graded_piece(lower, upper, features, growth)
+        pieces.append(piece)
     end = np.array([marks[-1]])
     return np.concatenate([*pieces, end])
 
@@ -252,7 +271,9 @@ def _graded_piece(
     """The points of `graded_axis` between two marks, the lower one included."""
     # The wanted width of a cell, as a function of its place, on a fine partition.
     fine = np.linspace(lower, upper, 4001)
-    middle = 0.5 * (fine[1:] + fine[:-1])
+    begins = fine[:-1]
+    ends = fine[1:]
+    middle = 0.5 * (ends + begins)
     width = np.full(len(middle), upper - lower)
     for first, last, spacing in features:
         outside = np.maximum(first - middle, middle - last)
@@ -267,6 +288,7 @@ def _graded_piece(
     total = count[-1]
     rounded_up = int(np.ceil(total - 1e-6))
     n_cells = max(rounded_up, 1)
-    whole = np.arange(1, n_cells) * (total / n_cells)
+    count_of_a_cell = total / n_cells
+    whole = np.arange(1, n_cells) * count_of_a_cell
     inner = np.interp(whole, count, fine)
     return np.append(lower, inner)

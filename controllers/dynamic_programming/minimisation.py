@@ -40,17 +40,22 @@ def nelder_mead(
     Returns:
         Minimisers (B, m) and values (B,), never worse than the start.
     """
-    m = start.shape[1]
-    every_row = np.arange(len(start))
+    count, m = start.shape
+    every_row = np.arange(count)
     vertices = _first_simplices(start, size, lower, upper)
-    columns = [objective(every_row, vertices[:, i]) for i in range(m + 1)]
+    columns = []
+    for i in range(m + 1):
+        column = objective(every_row, vertices[:, i])
+        columns.append(column)
     values = np.stack(columns, axis=1)
 
     for _ in range(iterations):
         # The best vertex first, the worst one last.
         order = np.argsort(values, axis=1, kind="stable")
+        order_of_vertices = order[:, :, None]
         values = np.take_along_axis(values, order, axis=1)
-        vertices = np.take_along_axis(vertices, order[:, :, None], axis=1)
+        vertices = np.take_along_axis(vertices, order_of_vertices, axis=1)
+        # Functions whose simplices lie flat are done: the others alone cost evaluations.
         spread = values[:, -1] - values[:, 0]
         rows = np.flatnonzero(spread > precision)
         if not len(rows):
@@ -75,10 +80,12 @@ def nelder_mead(
         direction = centre - worst_vertex
         trial = centre + factor[:, None] * direction
         trial = np.clip(trial, lower, upper)
+        # A reflection that is accepted and not the best stands without a second point.
         tried = np.flatnonzero(is_best | ~is_accepted)
         outcome = np.full(len(rows), np.inf)
         if len(tried):
-            outcome[tried] = objective(rows[tried], trial[tried])
+            tried_rows = rows[tried]
+            outcome[tried] = objective(tried_rows, trial[tried])
         trial_is_better = outcome < reflected
         candidate[trial_is_better] = trial[trial_is_better]
         outcome = np.minimum(outcome, reflected)
@@ -89,17 +96,35 @@ def nelder_mead(
         values[improved_rows, -1] = outcome[improved]
         # What no point improved shrinks towards its best vertex.
         shrinking = rows[~improved]
-        if not len(shrinking):
-            continue
-        for i in range(1, m + 1):
-            halfway = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
-            vertices[shrinking, i] = halfway
-            values[shrinking, i] = objective(shrinking, halfway)
+        if len(shrinking):
+            _shrink(objective, shrinking, vertices, values)
 
     best_vertex = values.argmin(axis=1)
     minimisers = vertices[every_row, best_vertex]
     least_values = values[every_row, best_vertex]
     return minimisers, least_values
+
+
+def _shrink(
+    objective: Objective,
+    rows: Indices,
+    vertices: Array,
+    values: Array,
+) -> None:
+    """Move the vertices of simplices halfway to their best one, in place.
+
+    Args:
+        objective: As `nelder_mead` takes it.
+        rows: Numbers of these simplices.
+        vertices: Those of all simplices, the best one first, (B, m+1, m).
+        values: At the vertices, (B, m+1).
+    """
+    n_vertices = values.shape[1]
+    best = vertices[rows, 0]
+    for i in range(1, n_vertices):
+        halfway = 0.5 * (best + vertices[rows, i])
+        vertices[rows, i] = halfway
+        values[rows, i] = objective(rows, halfway)
 
 
 def _first_simplices(
@@ -109,15 +134,17 @@ def _first_simplices(
     upper: Array,
 ) -> Array:
     """Vertices (B, m+1, m) of simplices with edges along the axes, within the box."""
-    m = start.shape[1]
+    _, m = start.shape
     inside = np.clip(start, lower, upper)
     vertices = np.repeat(inside[:, None], m + 1, axis=1)
     for i in range(m):
         # Vertex i+1 differs from the start in entry i, inwards where outwards leaves the box.
-        entry = vertices[:, i + 1, i]
-        outward = entry + size[:, i]
-        inward = entry - size[:, i]
-        moved = np.where(outward > upper[i], inward, outward)
+        entry = inside[:, i]
+        edge = size[:, i]
+        outward = entry + edge
+        inward = entry - edge
+        leaves = outward > upper[i]
+        moved = np.where(leaves, inward, outward)
         vertices[:, i + 1, i] = np.clip(moved, lower[i], upper[i])
     return vertices
 
@@ -144,7 +171,9 @@ def scan(
     every_row = np.arange(len(start))
     best = start.copy()
     values = objective(every_row, start)
-    axes = [np.linspace(low, high, points) for low, high in zip(lower, upper, strict=True)]
+    axes = []
+    for low, high in zip(lower, upper, strict=True):
+        axes.append(np.linspace(low, high, points))
     for point in itertools.product(*axes):
         candidate = np.broadcast_to(point, start.shape)
         outcome = objective(every_row, candidate)

@@ -89,7 +89,9 @@ def first_grid(
         first = lower - 0.1 * span
         last = upper + 0.1 * span
         marks = sorted({first, lower, reference, upper, last})
-        axes.append(graded_axis(marks, features, settings.growth**2))
+        # A start may be coarse: a cell is as much wider as two cells of later grids make.
+        growth = settings.growth**2
+        axes.append(graded_axis(marks, features, growth))
     return Grid(tuple(axes))
 
 
@@ -126,14 +128,16 @@ def refined(
     mass = np.maximum(optimum.distribution, 0.0)
     points = np.column_stack([grid.points, optimum.actions])
     mean = mass @ points / mass.sum()
-    deviation = operator.deviation(mean[:n], mean[n:])
+    mean_state = mean[:n]
+    mean_action = mean[n:]
+    deviation = operator.deviation(mean_state, mean_action)
 
     mass_on_grid = mass.reshape(grid.shape)
     axes = []
     intervals = []
     for i, axis in enumerate(grid.axes):
-        others = tuple(j for j in range(n) if j != i)
-        marginal = mass_on_grid.sum(axis=others)
+        other_axes = [j for j in range(n) if j != i]
+        marginal = mass_on_grid.sum(axis=tuple(other_axes))
         support = _support(axis, marginal, settings.tail)
         finer_axis = _refined_axis(operator, settings, level, i, axis, support, deviation[i])
         axes.append(finer_axis)
@@ -143,22 +147,25 @@ def refined(
         intervals.append((first, last))
     finer = Grid(tuple(axes), tuple(intervals) if smooth else None)
 
+    # Linear: a policy has kinks where an action meets its bound, at which a cubic overshoots.
     states = list(finer.points.T)
     linear = Grid(grid.axes)
     columns = []
     for action in optimum.actions.T:
         interpolated = linear.interpolant(action)
         columns.append(interpolated(states))
-    return start_policy(operator, finer, np.stack(columns, axis=1), 0.1)
+    actions = np.stack(columns, axis=1)
+    return start_policy(operator, finer, actions, share=0.1)
 
 
 def _support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:
     """Interval that holds all but `tail` of the mass at each end, and a cell on either side."""
     # A cell more on either side: the mass stands at points for what is between them.
     cumulative = np.cumsum(mass) / mass.sum()
-    ends = np.searchsorted(cumulative, (tail, 1.0 - tail))
-    first = max(ends[0] - 1, 0)
-    last = min(ends[1] + 1, len(axis) - 1)
+    begin, end = np.searchsorted(cumulative, (tail, 1.0 - tail))
+    last_point = len(axis) - 1
+    first = max(begin - 1, 0)
+    last = min(end + 1, last_point)
     return axis[first], axis[last]
 
 
@@ -182,19 +189,24 @@ def _refined_axis(
 
     # Dense within the support, and about each bound that the closed loop touches.
     refinement = 2**level
-    features = [(first, last, width / (settings.cells * refinement))]
+    n_cells = settings.cells * refinement
+    features = [(first, last, width / n_cells)]
     marks = {reference}
     near = max(deviation, 1e-3 * span)
     for bound in (lower, upper):
-        if first - deviation <= bound <= last + deviation:
+        is_touched = first - deviation <= bound <= last + deviation
+        if is_touched:
             marks.add(bound)
-            features.append((bound - near, bound + near, near / refinement))
+            about_bound = (bound - near, bound + near, near / refinement)
+            features.append(about_bound)
 
     # Without disturbance a state that strays never comes into the support's mass: keep the box.
     share = 1.0 if operator.deterministic else 0.05
     beyond = max(width, share * span)
-    low = max(axis[0], min(first, reference) - beyond)
-    high = min(axis[-1], max(last, reference) + beyond)
+    wanted_low = min(first, reference) - beyond
+    wanted_high = max(last, reference) + beyond
+    low = max(axis[0], wanted_low)
+    high = min(axis[-1], wanted_high)
     inner_marks = [x for x in sorted(marks) if low < x < high]
     return graded_axis([low, *inner_marks, high], features, settings.growth)
 
@@ -237,10 +249,13 @@ class Optimum:
     @property
     def edge_mass(self) -> float:
         """Share of samples that the closed loop spends on the edge of the grid's box."""
-        on_edge = np.zeros(self.grid.size, dtype=bool)
-        for axis, x in zip(self.grid.axes, self.grid.points.T, strict=True):
-            on_edge |= (x == axis[0]) | (x == axis[-1])
-        return float(self.distribution[on_edge].sum())
+        grid = self.grid
+        on_edge = np.zeros(grid.size, dtype=bool)
+        for axis, x in zip(grid.axes, grid.points.T, strict=True):
+            on_edge |= x == axis[0]
+            on_edge |= x == axis[-1]
+        mass_on_edge = self.distribution[on_edge]
+        return float(mass_on_edge.sum())
 
 
 def evaluate_policy(
@@ -271,10 +286,12 @@ def evaluate_policy(
     # [I − P  1; e_anchorᵀ  0] (W, g) = (c, 0).
     transition, cost = operator.chain(actions, grid)
     size = grid.size
-    unit = sparse.csr_array(([1.0], ([0], [anchor])), shape=(1, size))
+    place_of_anchor = ([0], [anchor])
+    unit = sparse.csr_array(([1.0], place_of_anchor), shape=(1, size))
     flow = sparse.eye_array(size) - (1.0 - RESTART_PROBABILITY) * transition
     ones = np.ones((size, 1))
-    bordered = sparse.block_array([[flow, ones], [unit, None]], format="csc")
+    blocks = [[flow, ones], [unit, None]]
+    bordered = sparse.block_array(blocks, format="csc")
     try:
         factors = splu(bordered)
     except RuntimeError as error:
@@ -308,6 +325,7 @@ def start_policy(
     anchor = grid.nearest(problem.reference_state)
     W, gain, distribution = evaluate_policy(operator, grid, actions, anchor)
     tenth = 0.1 * (problem.action_upper - problem.action_lower)
+    tenth_everywhere = np.tile(tenth, (grid.size, 1))
     return Optimum(
         grid=grid,
         actions=actions,
@@ -315,7 +333,7 @@ def start_policy(
         gain=gain,
         distribution=distribution,
         accuracy=operator.accuracy,
-        step=share * np.tile(tenth, (grid.size, 1)),
+        step=share * tenth_everywhere,
     )
 
 
@@ -342,7 +360,8 @@ def improve_policy(
     upper = operator.problem.action_upper
 
     def objective(rows: Indices, actions: Array) -> Array:
-        return operator.values(grid.points[rows], actions, grid, iterate.W)
+        states = grid.points[rows]
+        return operator.values(states, actions, grid, iterate.W)
 
     start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
     # A simplex twice as large as the last change of an action finds the next one.
@@ -441,8 +460,8 @@ def solve(
 
     # From the constant policy u_s to a first policy on the coarse grid.
     grid = first_grid(problem, draft, settings)
-    constant = np.tile(problem.reference_action, (grid.size, 1))
-    iterate = start_policy(draft, grid, constant)
+    constant_policy = np.tile(problem.reference_action, (grid.size, 1))
+    iterate = start_policy(draft, grid, constant_policy)
     iterate = approach(iterate, 0)
 
     # Linear interpolation is monotone, so it converges from any start; it smears the closed loop
@@ -455,8 +474,11 @@ def solve(
         iterate = approach(iterate, level)
 
     # One round that looks for better actions in the whole action box.
-    iterate = run(draft, iterate, settings.level, scan_points=9, rounds=1)
-    return _accepted(run(operator, iterate, settings.level))
+    last_level = settings.level
+    iterate = run(draft, iterate, last_level, scan_points=9, rounds=1)
+    # All so far was a start; the solution is of the full accuracy.
+    solution = run(operator, iterate, last_level)
+    return _accepted(solution)
 
 
 def _iterate(
@@ -565,14 +587,17 @@ def simulate_policy(
         d = list(disturbances.T)
         if k >= burn_in:
             (cost,) = stage_cost(x, u, d, parameters)
+            states = np.stack(x, axis=1)
             total += cost
-            total += problem.penalty.along(np.stack(x, axis=1))
+            total += problem.penalty.along(states)
         x_next = step(x, u, d, parameters)
         # A state that depends on no other may be one number.
         x = [np.broadcast_to(state, paths) for state in x_next]
 
+    # Paths are independent, the samples of one are not: the interval is that of the paths' means.
     means = total / steps
-    half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
+    deviation = means.std(ddof=1)
+    half_width = 1.96 * deviation / np.sqrt(paths)
     return float(means.mean()), float(half_width)
 
 
@@ -609,8 +634,9 @@ def certify(
     iterate = _iterate(operator, start, level, settings, progress)
     refinement = _accepted(iterate)
     mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
-    estimates = []
-    for name, solution in (("solution", optimum), ("refinement", refinement)):
-        estimates.append(GainEstimate(name, solution.gain, solution.lower, solution.upper))
-    estimates.append(GainEstimate("simulation", mean, mean - half_width, mean + half_width))
-    return replace(refinement, certificate=tuple(estimates))
+    certificate = (
+        GainEstimate("solution", optimum.gain, optimum.lower, optimum.upper),
+        GainEstimate("refinement", refinement.gain, refinement.lower, refinement.upper),
+        GainEstimate("simulation", mean, mean - half_width, mean + half_width),
+    )
+    return replace(refinement, certificate=certificate)

@@ -267,11 +267,13 @@ class Model:
         # Scenarios, files and messages know a quantity by its name alone.
         names: list[str] = []
         for kind in KINDS:
-            names += [quantity.name for quantity in getattr(self, kind)]
-        doubled = sorted({name for name in names if names.count(name) > 1})
+            quantities = getattr(self, kind)
+            names += [quantity.name for quantity in quantities]
+        doubled = {name for name in names if names.count(name) > 1}
         if doubled:
+            listed = ", ".join(sorted(doubled))
             raise ModelError(
-                f"model '{self.name}': {', '.join(doubled)} is the name of more than one quantity; "
+                f"model '{self.name}': {listed} is the name of more than one quantity; "
                 "give each a name of its own"
             )
         for kind in ("states", "actions"):
@@ -284,13 +286,15 @@ class Model:
         object.__setattr__(self, "uncertain", tuple(self.uncertain))
         self.parameter_indices(self.uncertain)
         # Called once with symbols: a mistake is reported where the model is made.
-        object.__setattr__(self, "ode", self._checked("ode", self.ode, len(self.states)))
+        ode = self._checked("ode", self.ode, len(self.states))
+        object.__setattr__(self, "ode", ode)
         economic_cost = self._checked("economic_cost", self.economic_cost, 1)
         object.__setattr__(self, "economic_cost", economic_cost)
         outputs = {}
         for output, function in self.outputs.items():
-            outputs[output] = self._checked(f"outputs['{output}']", function, 1)
-            self._check_output(outputs[output])
+            checked = self._checked(f"outputs['{output}']", function, 1)
+            self._check_output(checked)
+            outputs[output] = checked
         object.__setattr__(self, "outputs", outputs)
 
     def _checked(self, name: str, function: object, rows: int) -> ModelFunction:
@@ -310,7 +314,8 @@ class Model:
         """Refuse an output that depends on what is not known when it is measured."""
         x, u, d, p = self.symbols()
         expression = output(x, u, d, p)
-        if ca.depends_on(expression, ca.vertcat(u, d)):
+        not_known_yet = ca.vertcat(u, d)
+        if ca.depends_on(expression, not_known_yet):
             raise output.error(
                 "it depends on u or d, which act after the reading is taken: a measured output is "
                 "a function of x and p"
@@ -419,13 +424,16 @@ class Model:
 
             return call
 
+        outputs = {}
+        for name, output in self.outputs.items():
+            outputs[name] = rearranged(output)
         return replace(
             self,
             disturbances=tuple(rest),
             parameters=(*self.parameters, *moved),
             ode=rearranged(self.ode),
             economic_cost=rearranged(self.economic_cost),
-            outputs={name: rearranged(output) for name, output in self.outputs.items()},
+            outputs=outputs,
         )
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
@@ -475,7 +483,8 @@ def runge_kutta(
         k2 = rate(x + h / 2 * k1)
         k3 = rate(x + h / 2 * k2)
         k4 = rate(x + h * k3)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        slopes = k1 + 2 * k2 + 2 * k3 + k4
+        x = x + h / 6 * slopes
     return x
 
 

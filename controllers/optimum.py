@@ -62,16 +62,19 @@ def optimum_key(plant: PlantProblem, settings: Settings) -> str:
     symbols = model.symbols()
     rates = model.ode(*symbols)
     cost = model.economic_cost(*symbols)
+    law_facts = [law.kind, law.nominal.tolist(), law.ranges.tolist()]
+    settings_facts = asdict(settings) | {"criterion": "average"}
     content: dict[str, Any] = {
         "version": SOLVER_VERSION,
         "ode": _operations(rates, symbols),
         "cost": _operations(cost, symbols),
         "time_unit": model.time_unit,
         "sampling_time": problem.sampling_time,
+        # The mean cost per sample has no discount, whatever the controller's is.
         "discount": 1.0,
         "parameters": plant.parameters.tolist(),
-        "law": [law.kind, law.nominal.tolist(), law.ranges.tolist()],
-        "settings": asdict(settings) | {"criterion": "average"},
+        "law": law_facts,
+        "settings": settings_facts,
     }
     for name in VECTORS:
         content[name] = getattr(problem, name).tolist()
@@ -93,7 +96,9 @@ def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
         outputs = function.instruction_output(k)
         constant = ""
         if code == ca.OP_CONST:
-            constant = float(function.instruction_constant(k)).hex()
+            value = float(function.instruction_constant(k))
+            # All digits: another constant is another plant.
+            constant = value.hex()
         lines.append(f"{code} {inputs} {outputs} {constant}")
     return lines
 
@@ -178,15 +183,18 @@ def read_optimum(path: Path, key: str) -> Optimum:
 
 def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optimum:
     """The optimum in a file's arrays and document."""
-    n_axes = sum(name.startswith("axis_") for name in arrays)
-    axes = [arrays[f"axis_{i}"] for i in range(n_axes)]
+    axis_names = [name for name in arrays if name.startswith("axis_")]
+    axes = [arrays[f"axis_{i}"] for i in range(len(axis_names))]
     # JSON has lists for tuples, and may have a whole number for a float.
     smooth = document["smooth"]
     if smooth:
-        intervals = [(float(first), float(last)) for first, last in smooth]
+        intervals = []
+        for first, last in smooth:
+            intervals.append((float(first), float(last)))
         smooth = tuple(intervals)
     accuracy = document["accuracy"]
     estimates = document["certificate"] or ()
+    certificate = [GainEstimate(**estimate) for estimate in estimates]
     return Optimum(
         Grid(tuple(axes), smooth),
         actions=arrays["actions"],
@@ -200,7 +208,7 @@ def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optim
         ),
         lower=float(document["lower"]),
         upper=float(document["upper"]),
-        certificate=tuple(GainEstimate(**estimate) for estimate in estimates),
+        certificate=tuple(certificate),
     )
 
 
@@ -278,8 +286,11 @@ class OptimalPolicy:
         Args:
             scenario: of the plant; its actions are saturated as it says.
         """
+        if self.functions == INTERPRETED:
+            return None
         # A plant may have more states than the model, which the loop in C does not pick.
-        if self.functions == INTERPRETED or len(scenario.plant.states) != self.problem.n_states:
+        n_states = len(scenario.plant.states)
+        if n_states != self.problem.n_states:
             return None
         loop = CompiledTable.compile(self._table, self.problem.penalty, scenario)
         if loop is None:
@@ -304,7 +315,9 @@ class OptimalPolicy:
         """
         state: list[float] = np.asarray(s, dtype=np.float64).tolist()
         n = self.problem.n_states
-        if len(state) != n or not isfinite(sum(state)):
+        # A finite sum has finite terms: one test in place of n.
+        is_usable = len(state) == n and isfinite(sum(state))
+        if not is_usable:
             raise QpError(f"state {state} is not {n} finite numbers", status="bad state")
         # The grid ends where no sample of the closed loop was: say so, and go on.
         row, clamped = self._table.look_up(state)
@@ -333,7 +346,8 @@ class OptimalPolicy:
         m = problem.n_actions
         state = np.array(s, dtype=np.float64).reshape(1, -1)
         action = np.array(a, dtype=np.float64).reshape(1, -1)
-        if action.shape[1] != m or not np.isfinite(action).all():
+        is_usable = action.shape[1] == m and np.isfinite(action).all()
+        if not is_usable:
             raise QpError(
                 f"action {action[0].tolist()} is not {m} finite numbers",
                 status="bad action",
@@ -379,7 +393,8 @@ def fouling(scenario: Scenario) -> tuple[str, Callable[[ArrayLike], Vector]] | N
     def value(time: ArrayLike) -> Vector:
         days = np.asarray(time) / SECONDS_A_DAY
         since_cleaning = np.mod(days, period)
-        remaining = floor + (1.0 - floor) * np.exp(-rate * since_cleaning)
+        decay = np.exp(-rate * since_cleaning)
+        remaining = floor + (1.0 - floor) * decay
         return np.asarray(clean * remaining)
 
     return name, value
@@ -431,7 +446,9 @@ def _fouling_change(
     # A microsecond before the cleaning, and after it.
     fouled = value(cycle - 1e-6)
     clean = value(0.0)
-    nodes = np.linspace(fouled, clean, FOULING_NODES).round(6).tolist()
+    # Rounded: optima are stored by these values, whose last bits differ between processors.
+    values = np.linspace(fouled, clean, FOULING_NODES).round(6)
+    nodes = values.tolist()
     numbers = np.arange(FOULING_NODES)
 
     def position(time: ArrayLike) -> Vector:
@@ -440,11 +457,13 @@ def _fouling_change(
 
     # The mean over a cycle, whose integrand is smooth, by Gauss–Legendre.
     x, weights = np.polynomial.legendre.leggauss(40)
+    # The rule's nodes are in [−1, 1], its weights sum to 2.
+    times = 0.5 * cycle * (x + 1.0)
     return Change(
         plants=[frozen(scenario, name, node) for node in nodes],
         parameters={name: nodes},
         position=position,
-        times=0.5 * cycle * (x + 1.0),
+        times=times,
         weights=weights / 2.0,
     )
 
@@ -458,9 +477,11 @@ def _jumps(scenario: Scenario, changes: Sequence[ChangeTable]) -> Change:
     parameters: dict[str, Sequence[float]] = {}
     for change in changes:
         for name in change.parameters:
-            parameters[name] = [_parameter(plant, model, name) for plant in plants]
+            values = [_parameter(plant, model, name) for plant in plants]
+            parameters[name] = values
 
     def position(time: ArrayLike) -> Vector:
+        # The plant whose start was the last one.
         number = np.searchsorted(starts, time, side="right") - 1
         return np.asarray(number, dtype=np.float64)
 
@@ -606,11 +627,13 @@ def stored_optimum(scenario: Scenario) -> str | None:
     scenario names the plant's own model.
     """
     # Nobody knows which plant a foreign FMU is.
-    if is_file(scenario.plant.fmu) and scenario.plant.model is None:
+    plant_is_known = scenario.plant.model is not None
+    if is_file(scenario.plant.fmu) and not plant_is_known:
         return None
     change = change_of(scenario)
     # An optimum that is not stored would be solved for minutes: nobody has asked for that.
-    for plant in change.plants if change else [scenario]:
+    plants = change.plants if change else [scenario]
+    for plant in plants:
         try:
             problem = PlantProblem.from_scenario(plant)
         except (ModelError, OptimumError):
@@ -618,6 +641,7 @@ def stored_optimum(scenario: Scenario) -> str | None:
         # No controller is told what this policy needs.
         if problem.memory is not None:
             return None
-        if stored_file(optimum_key(problem, Settings())) is None:
+        key = optimum_key(problem, Settings())
+        if stored_file(key) is None:
             return None
     return "optimal"

@@ -130,9 +130,11 @@ class Scale:
         # The sizes come in the order in which they say most.
         level = next(iter(sizes.values()), 1.0)
         # Powers of two, so that scaling rounds nothing; limits keep products of scales finite.
-        range_powers = np.log2(np.clip(ranges, 1e-50, 1e50))
+        limited_ranges = np.clip(ranges, 1e-50, 1e50)
+        range_powers = np.log2(limited_ranges)
         both = 2.0 ** np.rint(range_powers)
-        cost_power = np.log2(np.clip(level, 1e-100, 1e100))
+        limited_level = np.clip(level, 1e-100, 1e100)
+        cost_power = np.log2(limited_level)
         cost = 4.0 ** np.rint(cost_power / 2)
         return cls(
             state=both[:n],
@@ -254,8 +256,9 @@ def multipliers(
     n_bounds = gradient.size
     size = np.abs(gradient).max()
     # Without a gradient nothing pushes; what is not finite is reported elsewhere.
-    finite = np.isfinite(gradient).all() and np.isfinite(rates).all()
-    if not size or not finite:
+    finite_gradient = np.isfinite(gradient).all()
+    finite_rates = np.isfinite(rates).all()
+    if not size or not finite_gradient or not finite_rates:
         return np.zeros(n_bounds)
 
     # An equation may be multiplied by any number: in rows of size 1 DAQP's tolerances mean what
@@ -535,8 +538,9 @@ class Problem:
         """
         model = self.model
         symbols = list(model.symbols())
-        expressions = [ca.SX(model.ode(*symbols)), ca.SX(model.economic_cost(*symbols))]
-        function = ca.Function("content", symbols, expressions)
+        rates = ca.SX(model.ode(*symbols))
+        cost = ca.SX(model.economic_cost(*symbols))
+        function = ca.Function("content", symbols, [rates, cost])
         if not_in_c([function]) is not None:
             return secrets.token_hex()
         numbers = []
@@ -671,7 +675,9 @@ class PlantProblem:
         problem = self.problem
         law = self.law
         memory = Memory(i, problem.n_states, phi)
-        model = remember(problem.model, memory, float(law.nominal[i]), float(law.ranges[i]))
+        nominal_value = float(law.nominal[i])
+        spread = float(law.ranges[i])
+        model = remember(problem.model, memory, nominal_value, spread)
         # The draw has no unit: the model gives the filter's value nominal value and range.
         nominal = law.nominal.copy()
         ranges = law.ranges.copy()
@@ -821,6 +827,7 @@ def _require_whole_state(scenario: Scenario, filtered: Mapping[str, float]) -> N
     if plant.model is not None:
         return
     fmu = _fmu_file(scenario)
+    # Of an array the scenario names an element, as level[1].
     named = {name.partition("[")[0] for name in plant.states}
     hidden = [name for name in continuous_states(fmu) if name not in named]
     if hidden:

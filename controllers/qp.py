@@ -91,14 +91,16 @@ class QpSolution(NamedTuple):
         pull = self.lam @ qp.rows
         y = qp.rows @ v
 
-        terms = np.array([qp.f, curvature, pull, nu, qp.H.diagonal()])
+        diagonal = qp.H.diagonal()
+        terms = np.array([qp.f, curvature, pull, nu, diagonal])
         sizes = np.abs(terms).max(axis=0)
         sizes = np.maximum(sizes, LEAST_SIZE)
         gradient = curvature + qp.f + nu + pull
         stationarity = np.abs(gradient) / sizes
 
         # (v, ν) is optimal in the bounds exactly where v is the projection of v + ν/σ on them.
-        projection = _projected(v + nu / sizes, qp.lower, qp.upper)
+        pushed = v + nu / sizes
+        projection = _projected(pushed, qp.lower, qp.upper)
         bounds = np.abs(v - projection)
 
         # The proximal operator of the soft bound: within the limits nothing is charged; one unit
@@ -106,7 +108,8 @@ class QpSolution(NamedTuple):
         shifted = y + self.lam / qp.w
         nearest = _projected(shifted, qp.row_lower, qp.row_upper)
         beyond = shifted - nearest
-        charged = np.maximum(np.abs(beyond) - 1.0, 0.0)
+        distance = np.abs(beyond)
+        charged = np.maximum(distance - 1.0, 0.0)
         softness = 1 + 2 * qp.W / qp.w
         violation = charged / softness
         proximal = nearest + np.copysign(violation, beyond)
@@ -142,8 +145,10 @@ class QpSolution(NamedTuple):
         # A variable is about to leave its bound: it is there, and ν is zero.
         nu_size = np.abs(self.nu)
         largest_nu = max(curvature, float(nu_size.max()))
-        distance = np.minimum(v - qp.lower, qp.upper - v)
-        at_bound = distance < tolerance * (1 + np.abs(v))
+        to_lower_bound = v - qp.lower
+        to_upper_bound = qp.upper - v
+        to_bound = np.minimum(to_lower_bound, to_upper_bound)
+        at_bound = to_bound < tolerance * (1 + np.abs(v))
         no_push = nu_size < tolerance * largest_nu
         leaves_bound = free & at_bound & no_push
         if leaves_bound.any():
@@ -156,13 +161,15 @@ class QpSolution(NamedTuple):
         to_limit = np.minimum(to_lower, to_upper)
         at_limit = to_limit < tolerance * (1 + np.abs(y))
         lam_size = np.abs(self.lam)
-        largest_lam = max(curvature, float(lam_size.max(initial=0.0)))
+        largest = float(lam_size.max(initial=0.0))
+        largest_lam = max(curvature, largest)
         leaving = lam_size < tolerance * largest_lam
         to_w = np.abs(lam_size - qp.w)
         yielding = to_w < tolerance * qp.w
         # Of a row at its limit that no free variable moves the multiplier is not unique.
         effects = np.abs(qp.rows[:, free])
-        unmoved = ~(effects.max(axis=1, initial=0.0) > 0)
+        moved = effects.max(axis=1, initial=0.0) > 0
+        unmoved = ~moved
         changes = at_limit & (leaving | yielding | unmoved)
         return bool(changes.any())
 
@@ -175,7 +182,8 @@ class QpSolution(NamedTuple):
         """
         v = self.v
         curvature = np.abs(qp.H.diagonal())
-        push = np.abs(self.nu) / np.maximum(curvature, LEAST_SIZE)
+        curvature = np.maximum(curvature, LEAST_SIZE)
+        push = np.abs(self.nu) / curvature
         distance = np.minimum(v - qp.lower, qp.upper - v)
         fixed = qp.lower == qp.upper
         at_bound = fixed | (distance < push)
@@ -203,6 +211,7 @@ class QpSolution(NamedTuple):
         n_rows, n_free = gradients.shape
         if n_rows == 0:
             return np.inf
+        # More gradients than dimensions are dependent, whatever they are.
         if n_rows > n_free:
             return 0.0
         norms = np.linalg.norm(gradients, axis=1, keepdims=True)
@@ -265,7 +274,8 @@ def multipliers_at_kink(
     above_lower = action > lower + width
     below_upper = action < upper - width
     inside = above_lower & below_upper
-    wanted, *_ = np.linalg.lstsq(kinked_rows[:, inside].T, total[inside])
+    effects = kinked_rows[:, inside]
+    wanted, *_ = np.linalg.lstsq(effects.T, total[inside])
 
     # λ is in [0, w] at an upper limit, in [−w, 0] at a lower one.
     w = qp.w[kinks]
@@ -312,7 +322,8 @@ def kkt_solve(
     # [H Γᵀ; Γ 0] for the free variables and the rows at their limit; column-major, as LAPACK
     # wants it.
     n_free = len(H)
-    size = n_free + len(equality_rows)
+    n_equations = len(equality_rows)
+    size = n_free + n_equations
     kkt = np.zeros((size, size), order="F")
     kkt[:n_free, :n_free] = H
     kkt[:n_free, n_free:] = equality_rows.T
@@ -391,7 +402,12 @@ def _newton_step(qp: SoftQp, solution: QpSolution) -> QpSolution:
     excess = qp.rows @ base - limit
     base_lam = push + weight * excess
     gradient = qp.H @ base + qp.f + base_lam @ qp.rows
-    (step,), (lam_at_limit,) = kkt_solve(qp, active, -gradient[None], -excess[None])
+    # One right-hand side: a row of each.
+    seeds = -gradient[None]
+    limits = -excess[None]
+    steps, multipliers = kkt_solve(qp, active, seeds, limits)
+    step = steps[0]
+    lam_at_limit = multipliers[0]
     v = base + step
     excess = qp.rows @ v - limit
     lam = lam_at_limit + push + weight * excess
@@ -667,7 +683,9 @@ def qpsolvers_problem(qp: SoftQp, *, dense: bool = True) -> qpsolvers.Problem:
 
     # Two inequalities a row: first those of the lower limits, then those of the upper ones.
     slack = np.diag(slack_unit)
-    G = np.block([[-qp.rows, -slack], [qp.rows, -slack]])
+    above_lower = [-qp.rows, -slack]
+    below_upper = [qp.rows, -slack]
+    G = np.block([above_lower, below_upper])
     h = np.concatenate([-qp.row_lower, qp.row_upper])
 
     # A fixed variable has an equation in the place of its bounds.

@@ -46,7 +46,8 @@ def symmetric_matrix(packed: Vector, dimension: int) -> Vector:
     """
     matrix = np.empty((dimension, dimension))
     rows, columns = upper_triangle(dimension)
-    matrix[rows, columns] = matrix[columns, rows] = packed
+    matrix[rows, columns] = packed
+    matrix[columns, rows] = packed
     return matrix
 
 
@@ -225,11 +226,11 @@ class ThetaBlocks:
         if model_parameters:
             model = problem.model
             indices = model.parameter_indices(model_parameters)
-            nominal = [model.parameters[i].nominal for i in indices]
+            scale = [0.1 * abs(model.parameters[i].nominal) for i in indices]
             parameters = ThetaBlock(
                 name="p",
                 shape=(len(indices),),
-                scale=tuple(0.1 * abs(value) for value in nominal),
+                scale=tuple(scale),
                 meaning="model parameters",
                 labels=model_parameters,
             )
@@ -328,7 +329,8 @@ class Parameters(Shown):
         import pandas as pd  # noqa: PLC0415 - half a second
 
         columns = {"theta": self.theta, "scale": self.blocks.scale}
-        return pd.DataFrame(columns, index=list(self.blocks.labels))
+        labels = list(self.blocks.labels)
+        return pd.DataFrame(columns, index=labels)
 
     def replace(self, blocks: Mapping[str, ArrayLike]) -> Parameters:
         """Copy with the named blocks set to new values."""
@@ -356,7 +358,9 @@ class Parameters(Shown):
         """All parameters of a model at θ, (n_p,): the nominal ones but for θ's block p."""
         values = model.nominal_parameters
         if "p" in self.blocks:
-            values[model.parameter_indices(self.blocks.block("p").labels)] = self["p"]
+            names = self.blocks.block("p").labels
+            indices = model.parameter_indices(names)
+            values[indices] = self["p"]
         return values
 
     def require_well_posed(self) -> None:
@@ -413,16 +417,20 @@ class Parameters(Shown):
 
     def to_toml(self) -> str:
         """θ as TOML with schema version and hash."""
+        values = {}
+        for block in self.blocks:
+            values[block.name] = self[block.name].tolist()
         document: dict[str, Any] = {
             "schema": 1,
             "hash": self.hash,
-            "theta": {block.name: self[block.name].tolist() for block in self.blocks},
+            "theta": values,
         }
         if "p" in self.blocks:
             names = self.blocks.block("p").labels
             document["model_parameters"] = list(names)
         if "noise" in self.blocks:
-            document["noise"] = list(self.blocks.block("noise").labels)
+            labels = self.blocks.block("noise").labels
+            document["noise"] = list(labels)
         return tomli_w.dumps(document)
 
     def save(self, path: str | Path) -> Path:
@@ -507,21 +515,26 @@ def symbolic_theta(problem: Problem, blocks: ThetaBlocks, behind: int = 0) -> Sy
             # Where each of the matrix's entries is among the packed ones.
             numbers = np.arange(float(block.size))
             places = block.unpack(numbers).astype(int)
-            entries = part[places.reshape(-1).tolist()]
+            in_sequence = places.reshape(-1).tolist()
+            entries = part[in_sequence]
+            # CasADi fills columns, NumPy read rows: of a symmetric matrix both are the same.
             part = ca.reshape(entries, *block.shape)
         symbols[block.name] = part
 
     # So that what reads the weights need not ask whether they are learned.
     if "w_sigma" not in blocks:
-        symbols["w_sigma"] = ca.SX(ca.DM(problem.penalty_linear))
-        symbols["W_sigma"] = ca.SX(ca.DM(problem.penalty_quadratic))
+        linear = ca.DM(problem.penalty_linear)
+        quadratic = ca.DM(problem.penalty_quadratic)
+        symbols["w_sigma"] = ca.SX(linear)
+        symbols["W_sigma"] = ca.SX(quadratic)
 
     # Parameters that θ does not hold stay at their nominal values.
     model = problem.model
     parameters = ca.SX(ca.DM(model.nominal_parameters))
     if "p" in blocks:
         names = blocks.block("p").labels
-        for i, index in enumerate(model.parameter_indices(names)):
+        indices = model.parameter_indices(names)
+        for i, index in enumerate(indices):
             parameters[index] = symbols["p"][i]
     symbols["model_parameters"] = parameters
     return symbols

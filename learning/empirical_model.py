@@ -116,7 +116,11 @@ class EmpiricalModelConfiguration(Configuration):
     )
 
 
-def displaced(nominal: Array, magnitudes: Array, share: Any) -> list[Any]:
+def displaced(
+    nominal: Array,
+    magnitudes: Array,
+    share: Any,
+) -> list[Any]:
     """Values a share of their magnitude away from the nominal ones.
 
     Args:
@@ -128,7 +132,8 @@ def displaced(nominal: Array, magnitudes: Array, share: Any) -> list[Any]:
         nominal + magnitude · share of each.
     """
     values = []
-    for i, (value, magnitude) in enumerate(zip(nominal, magnitudes, strict=True)):
+    pairs = zip(nominal, magnitudes, strict=True)
+    for i, (value, magnitude) in enumerate(pairs):
         if value == 0:
             values.append(magnitude * share[i])
             continue
@@ -158,17 +163,21 @@ class Features:
         x, u, c, y = _with_errors(problem)
         n_parameters = len(problem.model.parameters)
         G = ca.jacobian(y, c)
-        at_nominal = ca.DM.zeros(c.shape)
-        by_disturbance = ca.substitute(G[:, n_parameters:], c, at_nominal)
-        h = _error_sizes(problem, x, u, by_disturbance, smallest_error_size)
+        # h is that of c = 0: it must not move with what is fitted.
+        by_disturbance = G[:, n_parameters:]
+        no_errors = ca.DM.zeros(c.shape)
+        at_nominal = ca.substitute(by_disturbance, c, no_errors)
+        h = _error_sizes(problem, x, u, at_nominal, smallest_error_size)
         y = ca.densify(y)
         G = ca.densify(G)
 
         # One function for the loop (y, h), one for the fit, which needs G too.
         arguments = [x, u, c]
         names = ["x", "u", "c"]
-        self.mean = ca.Function("nominal", arguments, [y, h], names, ["y", "h"])
-        self._function = ca.Function("features", arguments, [y, G.T, h], names, ["y", "G", "h"])
+        mean = [y, h]
+        features = [y, G.T, h]
+        self.mean = ca.Function("nominal", arguments, mean, names, ["y", "h"])
+        self._function = ca.Function("features", arguments, features, names, ["y", "G", "h"])
         self.n_outputs, self.n_parameters = G.shape
         self.n_inputs = problem.n_states + problem.n_actions
         self.compiled: Any = None
@@ -234,11 +243,14 @@ def _with_errors(problem: Problem) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
     x, u, d, p = model.symbols()
     simulate = discretise(model, problem.sampling_time, problem.substeps)
     cost = economic_cost(model)
-    outputs = ca.vertcat(simulate(x, u, d, p), cost(x, u, d, p))
+    next_x = simulate(x, u, d, p)
+    stage_cost = cost(x, u, d, p)
+    outputs = ca.vertcat(next_x, stage_cost)
 
     # Parameters are c times their value larger, disturbances c times their magnitude.
     n_parameters = p.numel()
-    c = ca.SX.sym("c", n_parameters + d.numel())
+    n_disturbances = d.numel()
+    c = ca.SX.sym("c", n_parameters + n_disturbances)
     growth = 1 + c[:n_parameters]
     parameters = ca.DM(model.nominal_parameters) * growth
     disturbances = displaced(
@@ -247,7 +259,8 @@ def _with_errors(problem: Problem) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         c[n_parameters:],
     )
     at_errors = ca.vertcat(parameters, *disturbances)
-    (y,) = ca.substitute([outputs], [ca.vertcat(p, d)], [at_errors])
+    symbols = ca.vertcat(p, d)
+    (y,) = ca.substitute([outputs], [symbols], [at_errors])
     return x, u, c, y
 
 
@@ -270,8 +283,10 @@ def _error_sizes(
     size = ca.sqrt(ca.sum2(by_disturbance**2))
     size_at = ca.Function("size", [x, u], [size])
     at_reference = size_at(problem.reference_state, problem.reference_action)
+    references = at_reference.full()[:, 0]
+    entries = ca.vertsplit(size)
     floored = []
-    for entry, reference in zip(ca.vertsplit(size), at_reference.full()[:, 0], strict=True):
+    for entry, reference in zip(entries, references, strict=True):
         if reference > 0:
             floored.append(ca.fmax(entry, smallest * reference))
         else:
@@ -337,9 +352,11 @@ class _Regression:
         self._inputs = inputs
         self._outputs = outputs
         self._settings = settings
-        unit = inputs.std(axis=0)
-        unit = np.where(unit > 0, unit, 1.0)
-        self.standardisation = Standardisation(inputs.mean(axis=0), unit)
+        centre = inputs.mean(axis=0)
+        spread = inputs.std(axis=0)
+        # An input that never moved has no slope: any unit serves.
+        unit = np.where(spread > 0, spread, 1.0)
+        self.standardisation = Standardisation(centre, unit)
 
     def equations(
         self,
@@ -358,7 +375,8 @@ class _Regression:
         design, target = self._linearised(c, rows)
         if persistence.any():
             # What persists of the error before is no news (Cochrane and Orcutt 1949).
-            design_before, target_before = self._linearised(c, rows[1:] - 1)
+            rows_before = rows[1:] - 1
+            design_before, target_before = self._linearised(c, rows_before)
             design = design[1:] - persistence @ design_before
             target = target[1:] - target_before @ persistence.T
         return design, target
@@ -381,7 +399,11 @@ class _Regression:
         rows = self._samples(step)
         errors = self._errors(mean, rows)
         # Of consecutive samples the errors before are at hand.
-        before = errors[:-1] if step == 1 else self._errors(mean, rows[1:] - 1)
+        if step == 1:
+            before = errors[:-1]
+        else:
+            rows_before = rows[1:] - 1
+            before = self._errors(mean, rows_before)
         persistence = estimate_persistence(
             errors[1:],
             before,
@@ -400,7 +422,9 @@ class _Regression:
 
     def _linearised(self, c: Array, rows: Rows) -> tuple[Array, Array]:
         """Design and target of some samples about c, over h."""
-        design = self.standardisation.design(self._features, self._inputs[rows], c)
+        inputs = self._inputs[rows]
+        design = self.standardisation.design(self._features, inputs, c)
+        # Linear in c: y(c̄) ≈ y(c) + G (c̄ − c), so that what is known stands on one side.
         target = self._outputs[rows] - design.y + design.G @ c
         return design.over_h, target / design.h
 
@@ -409,8 +433,10 @@ class _Regression:
         p = self._features.n_parameters
         c = mean[:p]
         W = mean[p:]
-        design = self.standardisation.design(self._features, self._inputs[rows], c)
-        of_nominal = (self._outputs[rows] - design.y) / design.h
+        inputs = self._inputs[rows]
+        outputs = self._outputs[rows]
+        design = self.standardisation.design(self._features, inputs, c)
+        of_nominal = (outputs - design.y) / design.h
         linear_part = design.over_h[:, :, p:] @ W
         errors: Array = of_nominal - linear_part
         return errors
@@ -474,7 +500,8 @@ class EmpiricalModel:
         # The sizes of the nominal model's errors set the widths of W.
         priors = _priors(nominal_errors, y, features, settings)
         relative = y / h
-        least_variance = INTEGRATION_ERROR**2 * (relative**2).mean(axis=0)
+        mean_square = (relative**2).mean(axis=0)
+        least_variance = INTEGRATION_ERROR**2 * mean_square
 
         # Φ begins at that of the nominal errors: W, fitted to states that persistent errors have
         # moved, would take these for its own, and leave none that persist.
@@ -565,8 +592,10 @@ class EmpiricalModel:
     @property
     def error_deviation(self) -> Array:
         """Standard deviation of r, (K,)."""
+        # The residuals' own deviation, larger by what persists of them.
         growth = np.diag(self.error_covariance) / np.diag(self.noise)
-        deviation: Array = self.residuals.std(axis=0) * np.sqrt(growth)
+        of_residuals = self.residuals.std(axis=0)
+        deviation: Array = of_residuals * np.sqrt(growth)
         return deviation
 
     def mean_error_covariance(self, count: int) -> Array:
@@ -582,7 +611,9 @@ class EmpiricalModel:
         """c (p,) and W (K, 1+n+m) for inputs in their own units."""
         p = self.features.n_parameters
         c = self.mean[:p]
-        W = self.mean[p:].reshape(self.features.n_outputs, -1)
+        n_outputs = self.features.n_outputs
+        W = self.mean[p:].reshape(n_outputs, -1)
+        # W (1, z) with z = (inputs − centre) / unit.
         slopes = W[:, 1:] / self.unit
         constants = W[:, 0] - slopes @ self.centre
         return c, np.column_stack([constants, slopes])
@@ -621,9 +652,11 @@ def design_rows(G: Array, standardised: Array) -> Array:
         (M, K, p + K(1+n+m)).
     """
     M, K, p = G.shape
-    inputs = np.column_stack([np.ones(M), standardised])
+    ones = np.ones(M)
+    inputs = np.column_stack([ones, standardised])
     q = inputs.shape[1]
-    design = np.zeros((M, K, p + K * q))
+    n_coefficients = p + K * q
+    design = np.zeros((M, K, n_coefficients))
     design[:, :, :p] = G
     # Each output has a row of W of its own.
     for i in range(K):
@@ -668,14 +701,16 @@ def _triangle(rows: Array) -> Array:
     Some outputs are nearly exact, others noisy: normal equations would lose the latter. Blocks that
     fit in a processor's cache are factored first, which takes a third of the time.
     """
-    n_blocks = len(rows) // BLOCK
+    count, q = rows.shape
+    n_blocks = count // BLOCK
     n_whole = n_blocks * BLOCK
     whole = rows[:n_whole]
     rest = rows[n_whole:]
-    blocks = whole.reshape(n_blocks, BLOCK, rows.shape[1])
+    blocks = whole.reshape(n_blocks, BLOCK, q)
     triangles = np.linalg.qr(blocks, mode="r")
     stacked = np.concatenate([*triangles, rest])
-    return np.asarray(np.linalg.qr(stacked, mode="r"))
+    triangle = np.linalg.qr(stacked, mode="r")
+    return np.asarray(triangle)
 
 
 def _posterior(
@@ -697,9 +732,11 @@ def _posterior(
     whiten = np.linalg.inv(cholesky)
     white_design = whiten @ design
     white_target = target @ whiten.T
+    # An equation for each output of each sample; the target is their last column.
+    n_coefficients = design.shape[2]
     equations = np.column_stack(
         [
-            white_design.reshape(-1, design.shape[2]),
+            white_design.reshape(-1, n_coefficients),
             white_target.reshape(-1),
         ]
     )
@@ -712,8 +749,10 @@ def _posterior(
         # The prior as further rows: a ridge regression by QR.
         data_rows = R_design * prior
         prior_rows = np.eye(prior.size)
-        Q, root = np.linalg.qr(np.concatenate([data_rows, prior_rows]))
-        moment = Q[: len(R)].T @ R_target
+        all_rows = np.concatenate([data_rows, prior_rows])
+        Q, root = np.linalg.qr(all_rows)
+        Q_data = Q[: len(R)]
+        moment = Q_data.T @ R_target
         factor = prior[:, None] * np.linalg.inv(root)
         # Evidence: how well the data are explained, less what the fit could have explained.
         diagonal = np.abs(np.diag(root))

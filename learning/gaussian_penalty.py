@@ -35,14 +35,24 @@ def expected_penalties_with_errors(
     """
     n = means.shape[1]
     penalties = normal_penalties(penalty, means, variances)
+    # A variance may be below zero by rounding.
     deviations = np.sqrt(np.maximum(variances, 0.0))
     for i, seen in enumerate(errors):
-        states = means[:, i, None] + deviations[:, i, None] * seen
-        for row, excess in ((i, penalty.lower[i] - states), (n + i, states - penalty.upper[i])):
+        # The states (K, M_i) that an estimate would have had with each error that was seen.
+        mean = means[:, i, None]
+        deviation = deviations[:, i, None]
+        states = mean + deviation * seen
+        weight = n_normal + len(seen)
+        below = penalty.lower[i] - states
+        above = states - penalty.upper[i]
+        for row, excess in ((i, below), (n + i, above)):
             violation = np.maximum(excess, 0.0)
-            total = penalty.linear[i] * violation + penalty.quadratic[i] * violation**2
+            linear = penalty.linear[i] * violation
+            quadratic = penalty.quadratic[i] * violation**2
+            total = linear + quadratic
             by_law = n_normal * penalties[row]
-            penalties[row] = (by_law + total.sum(axis=1)) / (n_normal + len(seen))
+            by_errors = total.sum(axis=1)
+            penalties[row] = (by_law + by_errors) / weight
     return penalties
 
 
@@ -62,15 +72,24 @@ def normal_penalties(penalty: Penalty, means: Array, variances: Array) -> Array:
     """
     # A variance of zero, or below it by rounding, is a state that is known: the limit holds.
     least = np.finfo(np.float64).tiny
-    deviations = np.maximum(np.sqrt(np.maximum(variances, 0.0)), least)
+    deviations = np.sqrt(np.maximum(variances, 0.0))
+    deviations = np.maximum(deviations, least)
     below = penalty.lower - means
     above = means - penalty.upper
     both = []
     for excess in (below, above):
+        # The limits keep z² finite; φ is zero and Φ is 0 or 1 long before them.
         z = np.clip(excess / deviations, -1e6, 1e6)
         density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
         probability = ndtr(z)
-        violation = np.maximum(excess * probability + deviations * density, 0.0)
-        square = (excess**2 + deviations**2) * probability + excess * deviations * density
-        both.append(penalty.linear * violation + penalty.quadratic * np.maximum(square, 0.0))
-    return np.concatenate(both, axis=1).T
+
+        # E[v] and E[v²]; far inside the bound rounding may leave less than nothing.
+        mean = excess * probability + deviations * density
+        mean = np.maximum(mean, 0.0)
+        mean_square = (excess**2 + deviations**2) * probability + excess * deviations * density
+        mean_square = np.maximum(mean_square, 0.0)
+        linear = penalty.linear * mean
+        quadratic = penalty.quadratic * mean_square
+        both.append(linear + quadratic)
+    by_sample = np.concatenate(both, axis=1)
+    return by_sample.T

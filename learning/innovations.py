@@ -16,7 +16,11 @@ from controllers.estimator import ExtendedKalmanFilter
 from cosim.core.protocols import Array, Vector
 
 
-def replay(estimator: ExtendedKalmanFilter, readings: Array, actions: Array) -> Array:
+def replay(
+    estimator: ExtendedKalmanFilter,
+    readings: Array,
+    actions: Array,
+) -> Array:
     """Run a filter over data; it ends at the last sample, after its correction.
 
     Args:
@@ -66,9 +70,13 @@ def fit_noise(
     def loss(noise: Vector) -> tuple[float, Vector]:
         estimator.noise = noise
         replay(estimator, readings, actions)
+        # Less the logarithm of the posterior density: of the prior, and of the likelihood.
         away = (noise - prior_mean) / prior_width
-        value = float(away @ away) / 2 - estimator.log_likelihood
-        return value, away / prior_width - sensitivities.log_likelihood
+        of_prior = float(away @ away) / 2
+        value = of_prior - estimator.log_likelihood
+        gradient_of_prior = away / prior_width
+        gradient = gradient_of_prior - sensitivities.log_likelihood
+        return value, gradient
 
     # Four deviations of the prior: a filter beyond them overflows. A θ file may be from far away.
     least = prior_mean - 4.0 * prior_width
@@ -84,5 +92,7 @@ def fit_noise(
             options={"maxiter": rounds, "maxfun": 2 * rounds},
         )
     best: Vector = result.x if np.isfinite(result.fun) else start
+    # The last point that the method tried need not be the best one: once more with that.
     estimator.noise = best
-    return best, replay(estimator, readings, actions)
+    standardised = replay(estimator, readings, actions)
+    return best, standardised

@@ -48,6 +48,7 @@ class ModelFromOutputs(Algorithm):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         start = self.controller.parameters
+        settings = self.configuration
         if "noise" not in start.blocks:
             raise ConfigurationError(
                 f"model-based under sensors moves the estimator's variances, and scenario "
@@ -55,27 +56,32 @@ class ModelFromOutputs(Algorithm):
                 "and noise=false"
             )
         self._filter = ExtendedKalmanFilter.from_scenario(self.scenario, differentiates=True)
+        # What the scenario says of the variances, before a sample.
         self._prior_mean = self._filter.noise
-        self._plant = FittedPlant(self.scenario, start, self.configuration.normal_errors)
+        self._plant = FittedPlant(self.scenario, start, settings.normal_errors)
         problem = Problem.from_scenario(self.scenario)
+        # Back-offs are searched anew: they are counted from the true bounds.
         true_bounds = {"x_l": problem.state_lower, "x_u": problem.state_upper}
         self._base = start.replace(true_bounds)
         self._distance = problem.state_upper - problem.state_lower
-        self._delays = np.array([sensor.delay for sensor in self.scenario.sensors or ()])
+
         # A ring of (y, a).
+        sensors = self.scenario.sensors or ()
+        self._delays = np.array([sensor.delay for sensor in sensors])
         n_columns = self._delays.size + problem.n_actions
-        self._rows: Array = np.zeros((self.configuration.output_samples, n_columns))
+        self._rows: Array = np.zeros((settings.output_samples, n_columns))
         self._n_rows = 0  # since the last sample that is missing
+
         # Innovations of the sensors of each state, over their expected deviations.
         names = [quantity.name for quantity in problem.model.states]
         self._sensors_of_states = {}
-        for i, sensor in enumerate(self.scenario.sensors or ()):
+        for i, sensor in enumerate(sensors):
             if sensor.variable in names:
-                self._sensors_of_states[names.index(sensor.variable)] = i
+                state = names.index(sensor.variable)
+                self._sensors_of_states[state] = i
         self._errors: list[Array] = [np.empty(0) for _ in names]
         self._n_seen = 0  # samples whose innovations are among them
         self._count = 0
-        settings = self.configuration
         self._due = max(settings.first_update, settings.least_samples)
         self.predicted_cost = float("nan")
         """What the fitted plant costs at θ, mean per sample; NaN before the first update."""
@@ -86,7 +92,9 @@ class ModelFromOutputs(Algorithm):
         if self._count < self._due:
             return None
         settings = self.configuration
-        self._due = self._count + min(self._count, settings.longest_interval)
+        # While data are few an update waits until they have doubled.
+        interval = min(self._count, settings.longest_interval)
+        self._due = self._count + interval
         if self._n_rows < settings.least_samples:
             return None
         return self._update()
@@ -95,7 +103,8 @@ class ModelFromOutputs(Algorithm):
         """Keep a sample's readings; θ stays."""
         assert transition.y is not None
         row = np.concatenate([transition.y, transition.a])
-        self._rows[self._n_rows % len(self._rows)] = row
+        oldest = self._n_rows % len(self._rows)
+        self._rows[oldest] = row
         self._n_rows += 1
         self._count += 1
 
@@ -111,9 +120,13 @@ class ModelFromOutputs(Algorithm):
     @property
     def _data(self) -> tuple[Array, Array]:
         """Readings (M, n_y) and actions (M, m) of the latest samples, oldest first."""
-        count = min(self._n_rows, len(self._rows))
-        rows = self._rows[np.arange(self._n_rows - count, self._n_rows) % len(self._rows)]
-        readings, actions = np.split(rows, [self._delays.size], axis=1)
+        size = len(self._rows)
+        count = min(self._n_rows, size)
+        # The ring as time has it.
+        samples = np.arange(self._n_rows - count, self._n_rows)
+        rows = self._rows[samples % size]
+        n_sensors = self._delays.size
+        readings, actions = np.split(rows, [n_sensors], axis=1)
         # What was read before the data begin says nothing of their states.
         for i, delay in enumerate(self._delays):
             readings[:delay, i] = np.nan
@@ -132,20 +145,25 @@ class ModelFromOutputs(Algorithm):
             settings.fit_noise_rounds,
         )
         parameters = self._filter.parameters
-        base = _with_parameters(self._base.replace({"noise": noise}), parameters)
+        base = self._base.replace({"noise": noise})
+        base = _with_parameters(base, parameters)
         self._keep_errors(innovations)
         seed = int(self.rng.integers(2**63))
         self._plant.fit(self._filter, parameters, self._errors, seed)
 
+        # The search begins at the present back-offs; a bound of θ beyond the true one has none.
         lower = present["x_l"] - self._base["x_l"]
         upper = self._base["x_u"] - present["x_u"]
-        start = np.maximum(np.concatenate([lower, upper]), 0.0)
+        present_back_offs = np.concatenate([lower, upper])
+        start = np.maximum(present_back_offs, 0.0)
         search = BackOffsBehindFilter(self._plant, base, self._distance, settings)
         # Of few samples no back-off shrinks.
-        least = start if self._n_rows < settings.shrink_samples else np.zeros_like(start)
+        may_shrink = self._n_rows >= settings.shrink_samples
+        least = np.zeros_like(start) if may_shrink else start
         best = search.best(start, least)
         cost = search.cost(best)
         self.predicted_cost = cost.mean
+        # Where the best back-offs run away, too, the fitted plant says nothing of any θ.
         lost = not np.isfinite(cost.mean)
         if not lost:
             self.controller.theta = search.theta(best).theta
@@ -155,24 +173,30 @@ class ModelFromOutputs(Algorithm):
 
     def _keep_errors(self, innovations: Array) -> None:
         """Keep those of the samples since the last update, as this fit has them."""
-        new = innovations[-min(self._count - self._n_seen, len(innovations)) :]
+        n_new = min(self._count - self._n_seen, len(innovations))
+        new = innovations[-n_new:]
         self._n_seen = self._count
+        capacity = self.configuration.output_samples
         for state, sensor in self._sensors_of_states.items():
-            arrived = new[~np.isnan(new[:, sensor]), sensor]
+            of_sensor = new[:, sensor]
+            # Where nothing came there is no innovation.
+            arrived = of_sensor[~np.isnan(of_sensor)]
             kept = np.concatenate([self._errors[state], arrived])
-            self._errors[state] = kept[-self.configuration.output_samples :]
+            self._errors[state] = kept[-capacity:]
 
     def state_dict(self) -> State:
         """Readings, schedule and prediction; the filter's variances are θ's."""
-        return {
+        state: State = {
             "rows": self._rows,
             "n_rows": self._n_rows,
             "count": self._count,
             "due": self._due,
             "predicted_cost": self.predicted_cost,
             "n_seen": self._n_seen,
-            **{f"errors{i}": errors for i, errors in enumerate(self._errors)},
         }
+        for i, errors in enumerate(self._errors):
+            state[f"errors{i}"] = errors
+        return state
 
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned."""
@@ -182,7 +206,8 @@ class ModelFromOutputs(Algorithm):
         self._due = state["due"]
         self.predicted_cost = state["predicted_cost"]
         self._n_seen = state["n_seen"]
-        self._errors = [state[f"errors{i}"] for i in range(len(self._errors))]
+        n_states = len(self._errors)
+        self._errors = [state[f"errors{i}"] for i in range(n_states)]
 
 
 class SimulatedCost(NamedTuple):
@@ -208,13 +233,22 @@ class FittedPlant:
         n_normal: weight of a normal law beside the errors that were seen.
     """
 
-    def __init__(self, scenario: Scenario, parameters: Parameters, n_normal: float) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        parameters: Parameters,
+        n_normal: float,
+    ) -> None:
         problem = Problem.from_scenario(scenario)
         model = problem.model
         x, u, d, p = model.symbols()
-        next_x = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
-        results = {"x": next_x, "l": ca.SX(model.economic_cost(x, u, d, p))}
-        self._step = StackedFunction(define("fitted", {"s": x, "u": u, "d": d, "p": p}, results))
+        simulate = discretise(model, problem.sampling_time, problem.substeps)
+        next_x = simulate(x, u, d, p)
+        cost = ca.SX(model.economic_cost(x, u, d, p))
+        arguments = {"s": x, "u": u, "d": d, "p": p}
+        results = {"x": next_x, "l": cost}
+        definition = define("fitted", arguments, results)
+        self._step = StackedFunction(definition)
         self._scenario = scenario
         self._n_normal = n_normal
         self._model = model
@@ -240,20 +274,28 @@ class FittedPlant:
             errors: of each state that were seen, over their expected deviations, (M_i,).
             seed: of the noise, which all rollouts meet until the next fit.
         """
+        model = self._model
         self._errors = errors
         self._filter.noise = estimator.noise
+        # A rollout begins where the filter is at the last sample.
         state = estimator.state_dict()
         self._state = {name: state[name] for name in ("states", "covariance")}
-        self._p = self._model.nominal_parameters
+        self._p = model.nominal_parameters
         for name, value in parameters.items():
-            self._p[self._model.parameter_indices((name,))] = value
+            index = model.parameter_indices((name,))
+            self._p[index] = value
+
+        # The disturbances' variances come first in `noise`, the sensors' last.
         deviations = np.exp(estimator.noise / 2)
-        self._deviations = deviations[: len(self._model.disturbances)]
+        n_disturbances = len(model.disturbances)
+        self._deviations = deviations[:n_disturbances]
         tables = self._scenario.sensors or ()
-        of_sensors = deviations[len(deviations) - len(tables) :].tolist()
+        first_of_sensors = len(deviations) - len(tables)
+        of_sensors = deviations[first_of_sensors:].tolist()
         self._tables = []
         for table, deviation in zip(tables, of_sensors, strict=True):
-            self._tables.append(table.model_copy(update={"deviation": deviation}))
+            fitted = table.model_copy(update={"deviation": deviation})
+            self._tables.append(fitted)
         self._seed = seed
 
     def run(self, theta: Parameters, n_samples: int, burn_in: int) -> SimulatedCost:
@@ -288,14 +330,21 @@ class FittedPlant:
             try:
                 a = law.feedback(y).action
             except QpError:
-                return SimulatedCost(np.inf, np.full(2 * n, np.inf), np.zeros(n))
+                return SimulatedCost(
+                    mean=np.inf,
+                    penalties=np.full(2 * n, np.inf),
+                    deviation=np.zeros(n),
+                )
+            # The cost as a rule under sensors knows it: at the estimate, without noise.
             step.inputs["s"][:] = estimator.estimate
             step.inputs["u"][:] = a
             step.inputs["d"][:] = nominal
             step()
             costs[k] = step.part("l")[0]
+            # The simulated plant itself, which nobody sees but through the sensors.
+            draws = rng.standard_normal(nominal.size)
             step.inputs["s"][:] = s
-            step.inputs["d"][:] = nominal + self._deviations * rng.standard_normal(nominal.size)
+            step.inputs["d"][:] = nominal + self._deviations * draws
             step()
             s = step.part("x").copy()
             y = sensors.read(k + 1, self._measured(s))
@@ -307,15 +356,19 @@ class FittedPlant:
             self._n_normal,
         )
         by_bound = penalties.mean(axis=1)
-        mean = float(costs[burn_in:].mean() + by_bound.sum())
+        stage_cost = costs[burn_in:].mean()
+        mean = float(stage_cost + by_bound.sum())
+        # Of a loop that ran away: NaN would compare as neither more nor less.
         if not np.isfinite(mean):
             mean = np.inf
-        deviation = np.sqrt(variances[burn_in:].mean(axis=0))
+        mean_variance = variances[burn_in:].mean(axis=0)
+        deviation = np.sqrt(mean_variance)
         return SimulatedCost(mean, by_bound, deviation)
 
     def _measured(self, s: Vector) -> list[float]:
         """What the sensors' variables are at a state (n,), (n_y,)."""
-        values: list[float] = self._filter.expected_readings(s, self._p).tolist()
+        readings = self._filter.expected_readings(s, self._p)
+        values: list[float] = readings.tolist()
         return values
 
 
@@ -344,18 +397,24 @@ class BackOffsBehindFilter:
 
     def theta(self, delta: Vector) -> Parameters:
         """θ with its bounds backed off by δ."""
-        lower, upper = np.split(delta, 2)
-        return self._base.replace(
-            {"x_l": self._base["x_l"] + lower, "x_u": self._base["x_u"] - upper}
-        )
+        base = self._base
+        below, above = np.split(delta, 2)
+        bounds = {
+            "x_l": base["x_l"] + below,
+            "x_u": base["x_u"] - above,
+        }
+        return base.replace(bounds)
 
     def cost(self, delta: Vector) -> SimulatedCost:
         """The rollout at δ; all meet the same noise."""
+        # The search comes back to points, and a rollout is most of its time.
         key = delta.tobytes()
         if key not in self._known:
             settings = self._settings
             self._known[key] = self._plant.run(
-                self.theta(delta), settings.simulated_samples, settings.burn_in
+                self.theta(delta),
+                settings.simulated_samples,
+                settings.burn_in,
             )
         return self._known[key]
 
@@ -370,23 +429,38 @@ class BackOffsBehindFilter:
         """
         step = self._settings.back_off_step
         # A sweep that finds the place, and one that settles it.
-        for steps in ((step, step / 2), (step / 4,)):
-            shows = self._settings.least_penalty_share * abs(self.cost(delta).mean)
-            for i in np.flatnonzero(self.cost(delta).penalties > shows).tolist():
+        coarse = (step, step / 2)
+        fine = (step / 4,)
+        for steps in (coarse, fine):
+            cost = self.cost(delta)
+            shows = self._settings.least_penalty_share * abs(cost.mean)
+            active = np.flatnonzero(cost.penalties > shows)
+            for i in active.tolist():
                 delta = self._along(delta, i, least[i], steps)
         return delta
 
-    def _along(self, delta: Vector, i: int, least: float, steps: Sequence[float]) -> Vector:
+    def _along(
+        self,
+        delta: Vector,
+        i: int,
+        least: float,
+        steps: Sequence[float],
+    ) -> Vector:
         """The cheapest δ by steps of one back-off, taken until none is cheaper."""
-        unit = float(np.tile(self.cost(delta).deviation, 2)[i])
+        # In units of what the filter is off in that state, which has two bounds.
+        deviation = self.cost(delta).deviation
+        unit = float(deviation[i % deviation.size])
+        most = self._most[i]
         while True:
             points = [delta]
             for step in steps:
                 for sign in (-1.0, 1.0):
-                    value = np.clip(delta[i] + sign * step * unit, least, self._most[i])
+                    wanted = delta[i] + sign * step * unit
+                    value = np.clip(wanted, least, most)
                     point = delta.copy()
                     point[i] = value
                     points.append(point)
+            # Of equal costs the first counts, which is that of δ itself: the search ends.
             best = min(points, key=lambda point: self.cost(point).mean)
             if best is delta:
                 return delta
@@ -397,8 +471,10 @@ def _without_noise(parameters: Parameters) -> Parameters:
     """θ without the block `noise`, which is its last."""
     if "noise" not in parameters.blocks:
         return parameters
-    blocks = ThetaBlocks(tuple(block for block in parameters.blocks if block.name != "noise"))
-    return Parameters(blocks, parameters.theta[: blocks.size])
+    others = [block for block in parameters.blocks if block.name != "noise"]
+    blocks = ThetaBlocks(tuple(others))
+    theta = parameters.theta[: blocks.size]
+    return Parameters(blocks, theta)
 
 
 def _with_parameters(theta: Parameters, values: dict[str, float]) -> Parameters:
@@ -409,5 +485,6 @@ def _with_parameters(theta: Parameters, values: dict[str, float]) -> Parameters:
     labels = theta.blocks.block("p").labels
     for name, value in values.items():
         if name in labels:
-            p[labels.index(name)] = value
+            index = labels.index(name)
+            p[index] = value
     return theta.replace({"p": p})

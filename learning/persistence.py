@@ -50,21 +50,28 @@ def estimate_persistence(
     scaled_before = before / size
     solution, *_ = np.linalg.lstsq(scaled_before, scaled_later, rcond=1e-8)
     weight = n_earlier / (count + n_earlier)
+    # Rows of errors multiply from the left: Φᵀ, in the units of the scaled errors.
     scaled_earlier = earlier.T * size[:, None] / size
     solution = (1 - weight) * solution + weight * scaled_earlier
 
     # Log-likelihoods of normal errors, with and without what persists.
     innovations = scaled_later - scaled_before @ solution
-    gain = _log_determinant(scaled_later) - _log_determinant(innovations)
+    without = _log_determinant(scaled_later)
+    with_persistence = _log_determinant(innovations)
+    gain = without - with_persistence
     ratio = count * gain
     degrees = K**2
     deviation = (2 * degrees) ** 0.5
-    if ratio <= degrees + doubt * deviation and not weight:
+    # An earlier estimate has passed this test.
+    looks_independent = ratio <= degrees + doubt * deviation
+    if looks_independent and not weight:
         return np.zeros((K, K))
 
-    persistence: Array = (solution / size[:, None] * size).T
+    in_own_units = solution / size[:, None] * size
+    persistence: Array = in_own_units.T
     radius = max(_radius(persistence), 1e-9)
-    return persistence * min(1.0, largest / radius)
+    shrinkage = min(1.0, largest / radius)
+    return persistence * shrinkage
 
 
 def _log_determinant(values: Array) -> float:
@@ -100,7 +107,11 @@ def error_covariance(persistence: Array, innovations: Array) -> Array:
     return covariance
 
 
-def mean_error_covariance(persistence: Array, innovations: Array, count: int) -> Array:
+def mean_error_covariance(
+    persistence: Array,
+    innovations: Array,
+    count: int,
+) -> Array:
     """Covariance of the mean of consecutive r: Γ/T + Σ_k (1 − k/T) (Φᵏ Γ + Γ Φᵏᵀ)/T, k from 1.
 
     Args:
@@ -142,7 +153,10 @@ def effective_number(persistence: Array, count: int) -> float:
 def linear_part(states: Matrix, errors: Matrix) -> Matrix:
     """The part of errors (K, n) that is affine in the states (K, n), by least squares, (K, n)."""
     spread = states.std(axis=0)
-    z = (states - states.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    features = np.hstack([np.ones((len(z), 1)), z])
-    part: Matrix = features @ np.linalg.lstsq(features, errors)[0]
+    unit = np.where(spread > 0, spread, 1.0)
+    z = (states - states.mean(axis=0)) / unit
+    ones = np.ones((len(z), 1))
+    features = np.hstack([ones, z])
+    coefficients, *_ = np.linalg.lstsq(features, errors)
+    part: Matrix = features @ coefficients
     return part

@@ -108,7 +108,9 @@ class PlantData:
         inputs, outputs = self.present
         n_outdated = self.outdated(inputs, outputs)
         if n_outdated:
-            self.regime_start = self.count - len(inputs) + n_outdated
+            # The ring may have lost the first samples of the regime.
+            first = self.count - len(inputs)
+            self.regime_start = first + n_outdated
             inputs, outputs = self.present
         # Residuals from before a change fill up those of a young regime.
         room = max(self.settings.earlier_residuals - len(inputs), 0)
@@ -129,27 +131,33 @@ class PlantData:
             outputs: (s₊, ℓ), (M, K).
         """
         # Too few samples say nothing about older ones.
+        settings = self.settings
         n_latest = len(inputs) // 4
-        if n_latest < self.settings.forecast_samples:
+        if n_latest < settings.forecast_samples:
             return 0
         n_older = (len(inputs) - n_latest) // 2
         with_older = slice(0, -n_latest)
         without = slice(n_older, -n_latest)
         models = []
         for part in (with_older, without):
-            model = EmpiricalModel.fit(self.features, inputs[part], outputs[part], self.settings)
+            inputs_of_part = inputs[part]
+            outputs_of_part = outputs[part]
+            model = EmpiricalModel.fit(self.features, inputs_of_part, outputs_of_part, settings)
             models.append(model)
         # Both meet the noise of the newer model, and as many errors as are independent.
         newer = models[1]
         precision = np.linalg.pinv(newer.error_covariance)
         share = newer.effective_number(n_latest) / n_latest
+        latest_inputs = inputs[-n_latest:]
+        latest_outputs = outputs[-n_latest:]
         losses = []
         for model in models:
-            _, _, errors, _ = _compare(model, inputs[-n_latest:], outputs[-n_latest:])
+            errors = _compare(model, latest_inputs, latest_outputs).errors
             squares = float(np.einsum("mi,ij,mj->", errors, precision, errors))
             losses.append(share * squares / 2)
-        evidence = losses[0] - losses[1]
-        return n_older if evidence > self.settings.forecast_evidence else 0
+        loss_with_older, loss_without = losses
+        evidence = loss_with_older - loss_without
+        return n_older if evidence > settings.forecast_evidence else 0
 
     def predictions(self) -> Predictions:
         """Predictions of the samples since the fit, and their errors.
@@ -166,15 +174,19 @@ class PlantData:
         # One more, if there is one: its error persists in part.
         inputs, outputs = self.latest(new + 1)
         count = len(inputs)
-        for first in range(count - new, count - block + 1, block):
+        first_new = count - new
+        last_begin = count - block
+        for first in range(first_new, last_begin + 1, block):
             part = slice(first, first + block)
             predictions = _compare(model, inputs[part], outputs[part])
             if first > 0 and model.persistence.any():
+                # A prediction knows the error of the sample before, and what of it persists.
                 before = slice(first - 1, first)
-                _, _, error_before, _ = _compare(model, inputs[before], outputs[before])
+                error_before = _compare(model, inputs[before], outputs[before]).errors
                 errors_before = np.concatenate([error_before, predictions.errors[:-1]])
-                persisting = predictions.h * (errors_before @ model.persistence.T)
-                predictions = predictions._replace(outputs=predictions.outputs + persisting)
+                persisting = errors_before @ model.persistence.T
+                outputs_of_block = predictions.outputs + predictions.h * persisting
+                predictions = predictions._replace(outputs=outputs_of_block)
             self._blocks.append(predictions)
         n_latest = ceil(windows[-1] / block)
         latest = self._blocks[-n_latest:]
@@ -209,7 +221,8 @@ class PlantData:
             doubt = design @ model.covariance @ design.T
             squares = mean @ np.linalg.solve(noise + doubt, mean)
             # T² has an F distribution after this factor, of K and M − K degrees of freedom.
-            statistic = squares * (M - K) / (K * (M - 1))
+            scale = K * (M - 1)
+            statistic = squares * (M - K) / scale
             probability = fdtrc(K, M - K, max(statistic, 0.0))
             limit = self.settings.change_probability
             if window in suspect:
@@ -256,7 +269,11 @@ class PlantData:
         return EmpiricalModel(self.features, **state)
 
 
-def _compare(model: EmpiricalModel, inputs: Array, outputs: Array) -> Predictions:
+def _compare(
+    model: EmpiricalModel,
+    inputs: Array,
+    outputs: Array,
+) -> Predictions:
     """Predictions of a model at inputs (T, n+m), beside what came of them, (T, K)."""
     predicted, h, designs = model.predict(inputs)
     errors = (outputs - predicted) / h

@@ -69,9 +69,11 @@ def back_off(
         return _searched[key]
     plant = GuessedPlant(scenario, deviation)
     controller = nmpc(scenario, start)
-    loop = ClosedLoop(plant.step, measured(scenario, controller), scenario)
+    law = measured(scenario, controller)
+    loop = ClosedLoop(plant.step, law, scenario)
     rng = np.random.default_rng(0)
-    search = BackOffSearch(start, scenario, samples, rng, BackOffConfiguration.from_dict({}))
+    settings = BackOffConfiguration.from_dict({})
+    search = BackOffSearch(start, scenario, samples, rng, settings)
     while not search.has_ended:
         controller.theta = search.trial.theta
         # A segment begins at the initial state; all of a round meet the same noise.
@@ -105,20 +107,23 @@ def add_reserve(
     """
     scenario = scenario.still
     plant = GuessedPlant(scenario, deviation)
-    controller = measured(scenario, nmpc(scenario, start))
-    loop = ClosedLoop(plant.step, controller, scenario)
+    controller = nmpc(scenario, start)
+    law = measured(scenario, controller)
+    loop = ClosedLoop(plant.step, law, scenario)
     loop.start(plant.reset(0), plant.y)
     transitions = []
     # One run: where do the states go, and which bounds are active?
     for _ in range(samples):
-        transition = _transition(loop.advance(), scenario)
+        sample = loop.advance()
+        transition = _transition(sample, scenario)
         if transition is not None:
             transitions.append(transition)
     states = np.array([transition.s for transition in transitions])
     actions = np.array([transition.a for transition in transitions])
     next_states = np.array([transition.next_s for transition in transitions])
     gradients = np.array([transition.solution.value_gradient for transition in transitions])
-    errors = OneStepModel(scenario).errors(states, actions, next_states, start)
+    model = OneStepModel(scenario)
+    errors = model.errors(states, actions, next_states, start)
     most = reserve * errors.std(axis=0)
 
     # Half of what the states have left free.
@@ -159,12 +164,14 @@ class GuessedPlant:
         x, u, d, _ = model.symbols()
         p = ca.SX(ca.DM(model.nominal_parameters))
         simulate = discretise(model, problem.sampling_time, problem.substeps)
-        cost = model.economic_cost(x, u, d, p)
+        next_x = simulate(x, u, d, p)
+        cost = ca.SX(model.economic_cost(x, u, d, p))
         arguments = {"x": x, "u": u, "d": d}
-        results = {"y": simulate(x, u, d, p), "l": ca.SX(cost)}
+        results = {"y": next_x, "l": cost}
+        definition = define("f", arguments, results)
         self.scenario = scenario
         self._deviation = deviation
-        self._function = StackedFunction(define("f", arguments, results))
+        self._function = StackedFunction(definition)
         self._nominal = model.nominal_disturbance
         self._magnitudes = model.disturbance_magnitudes
         self._sensors: Sensors | None = None
@@ -180,14 +187,16 @@ class GuessedPlant:
         self._k = 0
         self.y: Array | None = None
         if self._sensors is not None:
-            self.y = self._sensors.start(seed, self._measured())
+            values = self._measured()
+            self.y = self._sensors.start(seed, values)
         return self._s
 
     def _measured(self) -> list[float]:
         """Present values of the variables that the sensors read, (n_y,)."""
         self._outputs.inputs["z"][:] = self._s
         self._outputs()
-        values: list[float] = self._outputs.part("y").tolist()
+        outputs = self._outputs.part("y")
+        values: list[float] = outputs.tolist()
         return values
 
     def step(self, a: Array) -> Step:
@@ -195,7 +204,8 @@ class GuessedPlant:
         s = self._s
         function = self._function
         # In proportion to their magnitudes: nobody knows more on the first day.
-        share = self._deviation * self._rng.standard_normal(self._nominal.size)
+        draws = self._rng.standard_normal(self._nominal.size)
+        share = self._deviation * draws
         d = np.array(displaced(self._nominal, self._magnitudes, share))
         function.inputs["x"][:] = s
         function.inputs["u"][:] = a
@@ -204,9 +214,12 @@ class GuessedPlant:
         self._s = function.part("y").copy()
         self._k += 1
         if self._sensors is not None:
-            self.y = self._sensors.read(self._k, self._measured())
+            values = self._measured()
+            self.y = self._sensors.read(self._k, values)
         stage_cost = float(function.part("l")[0])
-        return Step(self._s, stage_cost, self.scenario.state_penalty(s.tolist()), d, self.y)
+        # A sample's penalty is that of the state in which it begins.
+        penalty = self.scenario.state_penalty(s.tolist())
+        return Step(self._s, stage_cost, penalty, d, self.y)
 
 
 def _transition(sample: Sample, scenario: Scenario) -> Transition | None:
@@ -215,6 +228,9 @@ def _transition(sample: Sample, scenario: Scenario) -> Transition | None:
     if solution is None:
         return None
     step = sample.step
+    cost = step.stage_cost + step.penalty
+    next_penalty = scenario.state_penalty(step.s.tolist())
+    # The search reads neither Q nor what comes after: the sample's own solution stands for both.
     return Transition(
         number=0,
         s=sample.s,
@@ -223,9 +239,9 @@ def _transition(sample: Sample, scenario: Scenario) -> Transition | None:
         solution=solution,
         q_solution=solution,
         stage_cost=step.stage_cost,
-        cost=step.stage_cost + step.penalty,
+        cost=cost,
         next_s=step.s,
-        next_penalty=scenario.state_penalty(step.s.tolist()),
+        next_penalty=next_penalty,
         next_solution=solution,
         point=None,
         next_point=None,

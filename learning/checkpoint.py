@@ -76,7 +76,8 @@ def load(path: Path, run: Mapping[str, Any]) -> State:
     """
     try:
         entries = read_arrays(path)
-        stored = _flat(dict(json.loads(entries[RUN].tobytes())))
+        document = entries[RUN].tobytes()
+        stored = _flat(dict(json.loads(document)))
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: there is no checkpoint to resume from; run without --resume"
@@ -125,10 +126,13 @@ def part_of(state: Mapping[str, Any], prefix: str) -> State:
 def generator_state(rng: np.random.Generator) -> NDArray[np.uint64]:
     """State of a PCG64 generator as six words: two numbers of 128 bits, and a 32-bit draw left."""
     state: Any = rng.bit_generator.state
+    long_numbers = state["state"]
     # NumPy has no integers of 128 bits.
     words = []
-    for number in (state["state"]["state"], state["state"]["inc"]):
-        words += [number >> 64, number % 2**64]
+    for number in (long_numbers["state"], long_numbers["inc"]):
+        high = number >> 64
+        low = number % 2**64
+        words += [high, low]
     words += [state["has_uint32"], state["uinteger"]]
     return np.array(words, np.uint64)
 
@@ -159,8 +163,10 @@ def _refuse_another_run(
 ) -> None:
     """Raise CheckpointError by the first field that differs; `stored` is flat already."""
     # Compare both as JSON, where tuples are lists.
-    wanted = _flat(json.loads(json.dumps(run)))
-    for key in sorted(stored.keys() | wanted.keys()):
+    document = json.dumps(run)
+    wanted = _flat(json.loads(document))
+    keys = stored.keys() | wanted.keys()
+    for key in sorted(keys):
         if stored.get(key) != wanted.get(key):
             raise CheckpointError(
                 f"{path}: the checkpoint is of another run: {key} is {stored.get(key)!r} there and "

@@ -142,7 +142,8 @@ class Configuration(BaseModel):
     def _refuse_what_has_no_part(self) -> Self:
         # A setting that acts nowhere is a mistake of its user, who expects it to act.
         for name, where in self.without_part().items():
-            if getattr(self, name) != type(self).model_fields[name].default:
+            default = type(self).model_fields[name].default
+            if getattr(self, name) != default:
                 raise ValueError(f"{name}: has no part in {where}; leave it out")
         return self
 
@@ -155,7 +156,8 @@ class Configuration(BaseModel):
         for name, field in cls.model_fields.items():
             allowed = _allowed(properties[name])
             meaning = field.description or ""
-            documented.append(Hyperparameter(name, repr(field.default), allowed, meaning))
+            default = repr(field.default)
+            documented.append(Hyperparameter(name, default, allowed, meaning))
         return documented
 
 
@@ -202,14 +204,27 @@ def _allowed(schema: Mapping[str, Any]) -> str:
         return str(schema["const"])
     if "prefixItems" in schema:
         # Of a tuple of fixed length all entries are of one kind.
-        return f"{len(schema['prefixItems'])} × {_allowed(schema['prefixItems'][0])}"
+        entries = schema["prefixItems"]
+        return f"{len(entries)} × {_allowed(entries[0])}"
     if "items" in schema:
         return f"list of {_allowed(schema['items'])}"
-    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    signs = {
+        "exclusiveMinimum": ">",
+        "minimum": "≥",
+        "exclusiveMaximum": "<",
+        "maximum": "≤",
+    }
     limits = []
     for key, sign in signs.items():
         if key in schema:
             limits.append(f"{sign} {schema[key]:g}")
     kind = str(schema.get("type", ""))
-    words = {"boolean": "true, false", "null": "nothing", "string": "text"}
-    return " ".join([words.get(kind, kind), ", ".join(limits)]).strip()
+    words = {
+        "boolean": "true, false",
+        "null": "nothing",
+        "string": "text",
+    }
+    word = words.get(kind, kind)
+    range_in_words = ", ".join(limits)
+    # One of both may be missing.
+    return f"{word} {range_in_words}".strip()

@@ -72,17 +72,22 @@ class Dyna(QLearning):
         data.add(transition)
         since_fit = data.since_fit
         changed = False
-        if data.model is not None and since_fit % settings.change_windows[0] == 0:
-            changed = data.changed(data.predictions())
+        shortest_window = settings.change_windows[0]
+        if data.model is not None and since_fit % shortest_window == 0:
+            predictions = data.predictions()
+            changed = data.changed(predictions)
         if changed:
             # Noise and widths were those of another plant.
             self.begin_anew()
         age = data.age
-        due = since_fit >= max(settings.interval, age // settings.refit_growth)
+        growth = age // settings.refit_growth
+        due = since_fit >= max(settings.interval, growth)
         if not due and not changed:
             return update
         model = data.fit()
-        return self._imagine(model, transition.next_s, min(since_fit, age))
+        # Samples from before a change are of another plant than the model.
+        n_plant_samples = min(since_fit, age)
+        return self._imagine(model, transition.next_s, n_plant_samples)
 
     def _imagine(
         self,
@@ -104,13 +109,15 @@ class Dyna(QLearning):
         # From where the plant is: the model knows nothing of other places.
         loop.start(s)
         self._imagines = True
-        for _ in range(self.configuration.model_samples * n_plant_samples):
+        n_samples = self.configuration.model_samples * n_plant_samples
+        for _ in range(n_samples):
             transition, _ = loop.next()
             if transition is not None and super().observe(transition):
                 loop.renew()
         self._imagines = False
         self.model_samples += loop.counts.number
-        return update_without_fit(controller.parameters.blocks, before, controller.theta)
+        blocks = controller.parameters.blocks
+        return update_without_fit(blocks, before, controller.theta)
 
     def state_dict(self) -> State:
         """What Q-learning keeps, the data and the model."""
@@ -159,7 +166,8 @@ class ModelPlant(PlantInOperation):
             y, _, h = model.features(inputs[None], c)
             pick = rng.integers(len(model.residuals))
             linear = W @ np.append(1.0, inputs)
-            error = model.persistence @ error + model.residuals[pick]
+            persists = model.persistence @ error
+            error = persists + model.residuals[pick]
             outcome = y[0] + linear + h[0] * error
             present = outcome[:-1]
             stage_cost = float(outcome[-1])

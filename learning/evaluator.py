@@ -59,7 +59,8 @@ class Evaluator:
         # All that a training is compared with meets the same noise.
         problem = Problem.from_scenario(scenario)
         naive = nmpc(scenario, Parameters.naive(problem), run.controller)
-        naive_costs = self._costs(measured(scenario, naive))
+        naive_law = measured(scenario, naive)
+        naive_costs = self._costs(naive_law)
         self.baselines["naive"] = float(naive_costs["J"].mean())
         self._optimal_costs = np.full(run.evaluation_seeds, np.nan)
         if optimum is not None:
@@ -73,7 +74,8 @@ class Evaluator:
 
         # A cost may be negative (a profit): the margin is a share of its magnitude.
         worst = max(self.baselines["naive"], self.start["J"])
-        margin = (run.divergence - 1) * abs(worst)
+        excess = run.divergence - 1
+        margin = excess * abs(worst)
         self.limit = worst + margin
 
     def evaluate(self, theta: Array) -> dict[str, Any]:
@@ -102,7 +104,10 @@ class Evaluator:
         # A start that is the optimum leaves no gap.
         gap = gap_closed(J, self._start_costs, self._optimal_costs)
         difference = cost_difference(J, self._start_costs)
-        means: dict[str, Any] = {name: float(costs[name].mean()) for name in METRICS}
+        means: dict[str, Any] = {}
+        for name in METRICS:
+            means[name] = float(costs[name].mean())
+        # Failures are rare: how many there were says more than their mean.
         means["failures"] = int(costs["failures"].sum())
         return {
             **means,
@@ -130,7 +135,8 @@ def number_if_known(value: float) -> float | None:
 
 def _nothing_known() -> dict[str, Any]:
     """What `evaluate` returns where no held-out run is made."""
-    numbers: dict[str, Any] = dict.fromkeys((*METRICS, "failures", "difference"), nan)
+    names = (*METRICS, "failures", "difference")
+    numbers: dict[str, Any] = dict.fromkeys(names, nan)
     return {
         **numbers,
         "difference_interval": None,

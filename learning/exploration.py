@@ -32,13 +32,15 @@ class Strategy:
         self.kind = configuration.exploration
         self.lower = scenario.action_lower
         self.upper = scenario.action_upper
-        self.deviation: Vector = configuration.exploration_share * (self.upper - self.lower)
+        span = self.upper - self.lower
+        self.deviation: Vector = configuration.exploration_share * span
         if configuration.exploration_deviation is not None:
             self.deviation = np.array(configuration.exploration_deviation)
-        if self.deviation.size not in (1, self.lower.size):
+        n_actions = self.lower.size
+        if self.deviation.size not in (1, n_actions):
             raise ConfigurationError(
                 f"exploration_deviation has {self.deviation.size} entries; give one, or one for "
-                f"each of the {self.lower.size} actions"
+                f"each of the {n_actions} actions"
             )
         self.probability = configuration.exploration_probability
         self._full_samples = configuration.full_exploration
@@ -67,7 +69,8 @@ class Strategy:
         decay = min(1.0, self._full_samples / (number + 1))
         if draw >= self.probability * decay:
             return None
-        exploring: Vector = self._centre(action) + self.deviation * e
+        centre = self._centre(action)
+        exploring: Vector = centre + self.deviation * e
         return exploring
 
     def bias(self, actions: Matrix) -> Matrix:
@@ -87,7 +90,8 @@ class Strategy:
         # Mean of min(max(c + e, lower), upper): the density at the bounds, and their tails.
         density_low = np.exp(-(low**2) / 2)
         density_high = np.exp(-(high**2) / 2)
-        density = (density_low - density_high) / np.sqrt(2 * np.pi)
+        difference = density_low - density_high
+        density = difference / np.sqrt(2 * np.pi)
         tail_low = low * ndtr(low)
         tail_high = high * ndtr(-high)
         mean: Matrix = sigma * (density + tail_low + tail_high)

@@ -79,7 +79,9 @@ class Identified(Algorithm):
         if len(self._rows) < self._every:
             return None
         old = self.controller.theta
-        new = self._identified(np.array(self._rows))
+        rows = np.array(self._rows)
+        new = self._identified(rows)
+        # A fit is of one shift: the plant of the next one may be another.
         self._rows.clear()
         self.controller.theta = new.theta
         return update_without_fit(new.blocks, old, new.theta)
@@ -101,7 +103,8 @@ class Identified(Algorithm):
         actions = rows[:, n:-n]
         next_states = rows[:, -n:]
         p = self._fit(present, states, actions, next_states)
-        tuned = self._tuned(present.replace({"p": p}))
+        fitted = present.replace({"p": p})
+        tuned = self._tuned(fitted)
         # The errors that are left are those of the fitted model.
         if not self.configuration.back_off:
             return tuned
@@ -124,17 +127,20 @@ class Identified(Algorithm):
         unit = np.where(nominal != 0, np.abs(nominal), 1.0)
         errors_before = self._model.errors(states, actions, next_states, present)
         # An exact model has no errors to weigh by.
-        sigma = np.maximum(errors_before.std(axis=0), np.finfo(float).tiny)
+        tiny = np.finfo(float).tiny
+        sigma = np.maximum(errors_before.std(axis=0), tiny)
         values = self._model.parameters(present)
         offset = present["c_f"]
 
         def weighted_errors(scaled: Vector) -> Vector:
             values[indices] = scaled * unit
-            predicted = self._model.predict(states, actions, values) + offset
+            predicted = self._model.predict(states, actions, values)
+            predicted = predicted + offset
             errors = (next_states - predicted) / sigma
             return np.asarray(errors.reshape(-1))
 
-        solution = least_squares(weighted_errors, present["p"] / unit)
+        start = present["p"] / unit
+        solution = least_squares(weighted_errors, start)
         return np.asarray(solution.x * unit)
 
     def _tuned(self, fitted: Parameters) -> Parameters:

@@ -42,7 +42,8 @@ def to_csv(rows: Sequence[LogRow]) -> str:
     lines = []
     for row in rows:
         # One number a cell, whole ones without a point.
-        values = [*row.values(), *row.parameters.theta.tolist()]
+        theta = row.parameters.theta.tolist()
+        values = [*row.values(), *theta]
         lines.append([_cell(value) for value in values])
     return csv_text(columns, lines)
 
@@ -51,5 +52,7 @@ def _cell(value: float) -> str:
     if isnan(value):
         return ""
     # The cost of a diverged run is infinite.
-    whole = isfinite(value) and value == int(value)
-    return repr(int(value) if whole else value)
+    is_whole = isfinite(value) and value == int(value)
+    if is_whole:
+        return repr(int(value))
+    return repr(value)

@@ -146,14 +146,19 @@ class TrainingLoop:
         if self._loop.y is None or covariance is None:
             return self._penalty(s.tolist())
         variances = covariance.diagonal()
-        return float(normal_penalties(self._penalty, s[None], variances[None]).sum())
+        # One estimate: a row of each.
+        by_bound = normal_penalties(self._penalty, s[None], variances[None])
+        return float(by_bound.sum())
 
     @property
     def parameters(self) -> Parameters:
         """The final θ so far: the rule's own where it reports one, else the controller's."""
+        # A rule that tries θ has a candidate in the controller, and reports another one.
         theta = getattr(self.algorithm, "theta", None)
         present = self.controller.parameters
-        return present if theta is None else present.with_theta(theta)
+        if theta is None:
+            return present
+        return present.with_theta(theta)
 
     @property
     def has_ended(self) -> bool:
@@ -216,7 +221,8 @@ class TrainingLoop:
             return None
         self._go_back(back)
         blocks = self.controller.parameters.blocks
-        return update_without_fit(blocks, theta, back)._replace(retreated=True)
+        update = update_without_fit(blocks, theta, back)
+        return update._replace(retreated=True)
 
     def _go_back(self, theta: Vector) -> None:
         """Set θ back and tell the rule."""
@@ -299,7 +305,9 @@ class TrainingLoop:
             return loop.action(), False
         a = loop.saturate(wanted)
         self.counts.explored += 1
-        at_bound = (a == loop.lower) | (a == loop.upper)
+        at_lower = a == loop.lower
+        at_upper = a == loop.upper
+        at_bound = at_lower | at_upper
         self.counts.saturated += bool(at_bound.any())
         return a, True
 

@@ -53,7 +53,9 @@ class OffsetFree(Algorithm):
 
     def observe(self, transition: Transition) -> Update | None:
         """Filter the error of one prediction; every `update_every`-th moves θ."""
-        (predicted,) = self._model.predict(transition.s, transition.a, self._parameters)
+        s = transition.s
+        a = transition.a
+        (predicted,) = self._model.predict(s, a, self._parameters)
         error = transition.next_s - predicted
         self._errors.add(error)
         # A running mean until the memory is full, exponential from then on.
@@ -69,7 +71,8 @@ class OffsetFree(Algorithm):
 
     def _corrected(self) -> Parameters:
         """θ with the offset and the back-off as they are."""
-        present = self.controller.parameters.replace({"c_f": self._offset})
+        present = self.controller.parameters
+        present = present.replace({"c_f": self._offset})
         if not self.configuration.back_off:
             return present
         # Errors about the offset: it is in the predictions already.
@@ -78,8 +81,10 @@ class OffsetFree(Algorithm):
         if len(errors) == self.configuration.memory:
             return corrected
         # The largest of few errors is too small: the start's back-off counts too.
-        lower = np.maximum(corrected["x_l"], self._start["x_l"])
-        upper = np.minimum(corrected["x_u"], self._start["x_u"])
+        start = self._start
+        lower = np.maximum(corrected["x_l"], start["x_l"])
+        upper = np.minimum(corrected["x_u"], start["x_u"])
+        # Two back-offs that are each possible may leave no state between them.
         if (lower < upper).all():
             return corrected.replace({"x_l": lower, "x_u": upper})
         return corrected

@@ -61,9 +61,13 @@ class Coordinates:
         size = np.abs(scenario.reference_state)
         span = np.where(np.isfinite(span), span, size)
         span = np.where(span > 0, span, 1.0)
+        action_span = scenario.action_upper - scenario.action_lower
         states = width * span
-        actions = width * (scenario.action_upper - scenario.action_lower)
-        self._factors = {name: np.linalg.cholesky(start[name]) for name in HESSIAN_BLOCKS}
+        actions = width * action_span
+        self._factors = {}
+        for name in HESSIAN_BLOCKS:
+            self._factors[name] = np.linalg.cholesky(start[name])
+        # The order of the blocks is that of their coordinates in z.
         blocks = start.blocks
         self._units = {
             "B_Vf": np.ones(blocks.block("B_Vf").size),
@@ -100,7 +104,8 @@ class Coordinates:
         # A candidate without a feasible state would only fail.
         crossed = values["x_l"] >= values["x_u"]
         for name in ("x_l", "x_u"):
-            values[name] = np.where(crossed, start[name], values[name])
+            wanted = values[name]
+            values[name] = np.where(crossed, start[name], wanted)
         return start.replace(values)
 
 
@@ -154,8 +159,10 @@ class PolicySearch(Algorithm):
 
     def _try_candidate(self) -> None:
         """Set the controller's θ to that of the next candidate."""
-        z = self._population[len(self._evaluated)]
-        self.controller.theta = self._coordinates.theta(z).theta
+        number = len(self._evaluated)
+        z = self._population[number]
+        candidate = self._coordinates.theta(z)
+        self.controller.theta = candidate.theta
 
     def _tell(self, costs: list[float]) -> None:
         """Move the search distribution by the costs of a generation, and draw the next."""
@@ -177,7 +184,9 @@ class PolicySearch(Algorithm):
         if len(self._costs) < self.configuration.episode:
             return None
         settled = self._costs[self._settling :]
-        mean_cost = float(np.cumsum(settled)[-1]) / len(settled)
+        # The last of running sums: `np.sum` adds in another order, with other digits.
+        total = float(np.cumsum(settled)[-1])
+        mean_cost = total / len(settled)
         self._evaluated.append(mean_cost)
         self._costs = []
         mean_before = self.theta
@@ -186,7 +195,8 @@ class PolicySearch(Algorithm):
         if len(self._evaluated) == self.configuration.population:
             self._tell(self._evaluated)
             self._evaluated = []
-            self.theta = self._coordinates.theta(self._search.mean).theta
+            at_mean = self._coordinates.theta(self._search.mean)
+            self.theta = at_mean.theta
         self._try_candidate()
         # The log's step is that of the mean, its eigenvalue that of the candidate.
         of_candidate = update_without_fit(

@@ -41,8 +41,10 @@ class OneStepModel:
         # Two functions: that of the nominal parameters is called in every sample.
         y_nominal = simulate(x, u, d, p_nominal)
         y = simulate(x, u, d, p)
-        nominal = define("f", {"x": x, "u": u}, {"y": y_nominal})
-        parametric = define("f", {"x": x, "u": u, "p": p}, {"y": y})
+        inputs = {"x": x, "u": u}
+        inputs_and_parameters = {"x": x, "u": u, "p": p}
+        nominal = define("f", inputs, {"y": y_nominal})
+        parametric = define("f", inputs_and_parameters, {"y": y})
         self._nominal = StackedFunction(nominal)
         self._parametric = StackedFunction(parametric)
 
@@ -60,7 +62,8 @@ class OneStepModel:
         # A continuous pole −1/T is a discrete one of 1 − 1/T samples, to first order.
         A, _ = linear_model(self._problem)
         eigenvalues = np.linalg.eigvals(A)
-        rate = 1.0 - np.abs(eigenvalues).max()
+        slowest_pole = np.abs(eigenvalues).max()
+        rate = 1.0 - slowest_pole
         least = 1.0 / LONGEST_TIME_CONSTANT
         return float(1.0 / max(rate, least))
 
@@ -116,7 +119,8 @@ class OneStepModel:
             e, (K, n).
         """
         parameters = self.parameters(theta)
-        predicted = self.predict(states, actions, parameters) + theta["c_f"]
+        predicted = self.predict(states, actions, parameters)
+        predicted = predicted + theta["c_f"]
         return np.atleast_2d(next_states) - predicted
 
 
@@ -185,8 +189,10 @@ class SortedErrors:
 
 def _running_sums(values: Matrix) -> Matrix:
     """Sums of the first 0, 1, … M rows (M, n), (M+1, n)."""
-    zero = np.zeros((1, values.shape[1]))
-    return np.concatenate([zero, np.cumsum(values, axis=0)])
+    _, n = values.shape
+    zero = np.zeros((1, n))
+    sums = np.cumsum(values, axis=0)
+    return np.concatenate([zero, sums])
 
 
 def expected_penalties(
@@ -213,12 +219,14 @@ def expected_penalties(
     for i in range(n):
         predicted = predictions[:, i]
         h = scales[:, i]
-        for k, bound in enumerate((penalty.lower[i], penalty.upper[i])):
+        bounds = (penalty.lower[i], penalty.upper[i])
+        for k, bound in enumerate(bounds):
             if not np.isfinite(bound):
                 continue
             # In units of h the errors are the same for all predictions.
             threshold = (bound - predicted) / h
-            first, second = errors.beyond(i, threshold, above=bool(k))
+            is_upper = k == 1
+            first, second = errors.beyond(i, threshold, above=is_upper)
             linear = penalty.linear[i] * h * first
             quadratic = penalty.quadratic[i] * h**2 * second
             costs[i, k] = linear + quadratic
@@ -235,7 +243,8 @@ class PredictionErrors:
     def __init__(self, scenario: Scenario, capacity: int) -> None:
         self._penalty = scenario.state_penalty
         # A row a state: NumPy is three times as fast along the errors as along a few states.
-        self._errors = np.zeros((scenario.state_lower.size, capacity))
+        n_states = scenario.state_lower.size
+        self._errors = np.zeros((n_states, capacity))
         self.count = 0
 
     @property

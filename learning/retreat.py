@@ -40,7 +40,8 @@ class ShownCost(NamedTuple):
     @property
     def variance(self) -> float:
         """Variance of the mean, by the spread of the batches."""
-        return float(self.batches.var(ddof=1) / len(self.batches))
+        of_a_batch = self.batches.var(ddof=1)
+        return float(of_a_batch / len(self.batches))
 
 
 def exceeds(one: ShownCost, other: ShownCost, probability: float) -> bool:
@@ -51,6 +52,7 @@ def exceeds(one: ShownCost, other: ShownCost, probability: float) -> bool:
         other: the other one.
         probability: of an error where both are the same.
     """
+    # A cost that is not finite is above any other, and leaves no test.
     if not np.isfinite(one.batches).all():
         return True
     # Equal variances that are both zero leave no test: then the means decide.
@@ -75,7 +77,9 @@ def exceeds_prediction(cost: ShownCost, predicted: float, probability: float) ->
     excess = cost.mean - predicted
     if cost.variance == 0:
         return excess > 0
-    tail = stdtr(len(cost.batches) - 1, -excess / cost.variance**0.5)
+    degrees_of_freedom = len(cost.batches) - 1
+    deviation = cost.variance**0.5
+    tail = stdtr(degrees_of_freedom, -excess / deviation)
     return bool(tail < probability)
 
 
@@ -97,7 +101,12 @@ class Retreat:
         samples_to_wait: in which θ has to stay.
     """
 
-    def __init__(self, start: Vector, shift: int, probability: float) -> None:
+    def __init__(
+        self,
+        start: Vector,
+        shift: int,
+        probability: float,
+    ) -> None:
         self._start = start
         self._batch = max(shift // BATCHES, 1)
         self._probability = probability
@@ -143,15 +152,17 @@ class Retreat:
             self._end_of_start()
             self._theta = theta
             return None
-        if 2 * len(self._costs) == self.shift:
+        n_samples = len(self._costs)
+        if 2 * n_samples == self.shift:
             self._theta = theta
-        if len(self._costs) < self.shift:
+        if n_samples < self.shift:
             return None
         shown = self._shown()
         if not self._has_moved:
             self._best = self._with_best(shown)
             return None
         back = self._end_of_shift(shown, predicted)
+        # The rule may have gone there itself.
         if back is None or np.array_equal(back, theta):
             return None
         return back
@@ -194,7 +205,9 @@ class Retreat:
             return None
         if exceeds(shown, best, self._probability):
             return self._go_back(shown, best.theta)
-        hardly_known = best.variance > 9 * shown.variance and shown.mean < best.mean
+        # Against a cost that is known three times worse a test would show nothing for long.
+        is_cheaper = shown.mean < best.mean
+        hardly_known = is_cheaper and best.variance > 9 * shown.variance
         if hardly_known or exceeds(best, shown, self._probability):
             self._best = shown
         return None
@@ -227,7 +240,8 @@ class Retreat:
             "count": self.count,
             "samples_to_wait": self.samples_to_wait,
         }
-        for name, shown in (("best", self._best), ("left", self._left)):
+        shown_costs = {"best": self._best, "left": self._left}
+        for name, shown in shown_costs.items():
             if shown is not None:
                 state[f"{name}.theta"] = shown.theta
                 state[f"{name}.batches"] = shown.batches
@@ -247,4 +261,6 @@ class Retreat:
 def _restored(state: State, name: str) -> ShownCost | None:
     if f"{name}.theta" not in state:
         return None
-    return ShownCost(state[f"{name}.theta"], state[f"{name}.batches"])
+    theta = state[f"{name}.theta"]
+    batches = state[f"{name}.batches"]
+    return ShownCost(theta, batches)

@@ -100,7 +100,8 @@ class Rollout:
             return self._compiled(theta, start, model, picks)
 
         # CasADi's functions are not for several threads; compiled ones are.
-        with ThreadPoolExecutor(1 if self.compiled is None else None) as pool:
+        n_threads = 1 if self.compiled is None else None
+        with ThreadPoolExecutor(n_threads) as pool:
             return list(pool.map(one, thetas))
 
     def _compiled(
@@ -115,15 +116,17 @@ class Rollout:
         n_samples = len(picks)
         c, W = model.coefficients
         # C reads rows, one after the other.
-        arguments = []
-        for array in (theta, start, c, W, model.persistence, model.residuals, picks):
-            arguments.append(np.ascontiguousarray(array))
-        assert self.compiled is not None
-        # A row is the one of every closed loop: state and action, the plant's outputs, and more.
-        ends = np.cumsum([features.n_inputs, features.n_outputs, features.n_outputs])
+        arrays = [theta, start, c, W, model.persistence, model.residuals, picks]
+        in_rows = [np.ascontiguousarray(array) for array in arrays]
+        arguments = pointers(*in_rows)
         table = np.empty((n_samples, self._n_columns))
-        done = self.compiled(*pointers(*arguments), n_samples, *pointers(table))
+        assert self.compiled is not None
+        done = self.compiled(*arguments, n_samples, *pointers(table))
+        # A row is the one of every closed loop: state and action, the plant's outputs, and more.
+        sizes = [features.n_inputs, features.n_outputs, features.n_outputs]
+        ends = np.cumsum(sizes)
         inputs, predicted, h, _ = np.split(table[:done], ends, axis=1)
+        # Copies: the table, whose other columns nobody reads, need not stay.
         return RolloutSamples(inputs.copy(), predicted.copy(), h.copy())
 
     def _interpreted(
@@ -140,11 +143,15 @@ class Rollout:
         loop.start(start)
         n_samples = 0
         with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
-            while n_samples < len(picks) and np.isfinite(loop.s).all():
+            while n_samples < len(picks):
+                if not np.isfinite(loop.s).all():
+                    break
                 loop.advance()
                 n_samples += 1
         return RolloutSamples(
-            plant.inputs[:n_samples], plant.predicted[:n_samples], plant.h[:n_samples]
+            inputs=plant.inputs[:n_samples],
+            predicted=plant.predicted[:n_samples],
+            h=plant.h[:n_samples],
         )
 
 

@@ -81,7 +81,9 @@ def td_fit(
     weight = step_size * td_error / (1.0 + step_size * float(gradient @ gradient))
 
     def metric() -> Matrix:
-        return np.outer(gradient, gradient) + np.eye(gradient.size) / step_size
+        of_transition = np.outer(gradient, gradient)
+        of_step = np.eye(gradient.size) / step_size
+        return of_transition + of_step
 
     return Fit(
         gradient=td_error * gradient,
@@ -126,7 +128,8 @@ def policy_gradient_fit(
         metric: F, (n, n), positive definite, the Fisher matrix E[∇π ∇πᵀ].
     """
     half = -gradient / 2
-    minimiser = step_size * cho_solve(cho_factor(metric), half)
+    factor = cho_factor(metric)
+    minimiser = step_size * cho_solve(factor, half)
     return Fit(half, minimiser, lambda: metric / step_size)
 
 
@@ -143,7 +146,8 @@ def smallest_eigenvalue(blocks: ThetaBlocks, theta: Vector) -> float:
     # One number for both blocks: the smaller of their least eigenvalues.
     least = np.inf
     for name in HESSIAN_BLOCKS:
-        eigenvalues = np.linalg.eigvalsh(matrix_of(blocks, theta, name))
+        matrix = matrix_of(blocks, theta, name)
+        eigenvalues = np.linalg.eigvalsh(matrix)
         least = min(least, float(eigenvalues[0]))
     return least
 
@@ -164,7 +168,8 @@ def matrix_of(
         The matrix in its own unit.
     """
     where = blocks.slices[name]
-    return blocks.block(name).unpack(theta[where] / blocks.scale[where])
+    packed = theta[where] / blocks.scale[where]
+    return blocks.block(name).unpack(packed)
 
 
 def definite(
@@ -201,11 +206,14 @@ def definite(
         order, weight = svec_order(size)
         shifted = matrix_of(blocks, theta, name) - smallest * np.eye(size)
         # The step is in the fit's coordinates, the matrix in its own unit.
-        ratio = (scale[where] / blocks.scale[where])[order]
+        ratio = scale[where] / blocks.scale[where]
+        numbers = np.arange(block.size)
+        places = where.start + order
         rows = np.zeros((block.size, blocks.size))
-        rows[np.arange(block.size), where.start + order] = -weight * ratio
+        rows[numbers, places] = -weight * ratio[order]
         matrices.append(rows)
-        offsets.append(weight * block.pack(shifted)[order])
+        packed = block.pack(shifted)
+        offsets.append(weight * packed[order])
         cones.append(clarabel.PSDTriangleConeT(size))
     # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
     metric = fit.metric()
@@ -326,7 +334,9 @@ class ConstrainedStep:
         if reach > 1.0:
             new = theta + change / reach
         # Crossed bounds leave no feasible state, and no solver can mend them.
-        crossed = not (new[slices["x_l"]] < new[slices["x_u"]]).all()
+        lower = new[slices["x_l"]]
+        upper = new[slices["x_u"]]
+        crossed = not (lower < upper).all()
         refused = admissible is None or crossed
         if refused:
             new = theta
@@ -335,8 +345,14 @@ class ConstrainedStep:
         if not np.array_equal(new, free):
             least = smallest_eigenvalue(self.blocks, new)
         self._controller.theta = new
-        size = float(np.linalg.norm((new - theta) / self.scale))
-        return Update(td_error, size, least, corrected, bool(refused))
+        scaled_step = (new - theta) / self.scale
+        return Update(
+            td_error=td_error,
+            step=float(np.linalg.norm(scaled_step)),
+            smallest_eigenvalue=least,
+            corrected=corrected,
+            refused=bool(refused),
+        )
 
     def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
         """Set the controller's θ to the admissible one nearest to another, in scaled coordinates.
@@ -379,9 +395,10 @@ def update_without_fit(
         new: θ now, (n_θ,).
         refused: for the log.
     """
+    scaled_step = (new - old) / blocks.scale
     return Update(
         td_error=float("nan"),
-        step=float(np.linalg.norm((new - old) / blocks.scale)),
+        step=float(np.linalg.norm(scaled_step)),
         smallest_eigenvalue=smallest_eigenvalue(blocks, new),
         refused=refused,
     )

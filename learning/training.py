@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from importlib.metadata import version
-from math import inf, isfinite, isnan, nan
+from itertools import pairwise
+from math import ceil, inf, isfinite, isnan, nan
 from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -58,7 +59,12 @@ TRAINING_FILES = (
     "training.rrd",
 )  # fmt: skip
 """Files of a training; all in a folder belong to one run."""
-REMARKS = {"J": "J", "greedy_J": "greedy J", "regret": "regret", "td_error": "TD"}
+REMARKS = {
+    "J": "J",
+    "greedy_J": "greedy J",
+    "regret": "regret",
+    "td_error": "TD",
+}
 """Columns of the log behind the progress bar, with their text there."""
 
 
@@ -169,8 +175,10 @@ class Training(Result):
         evaluations = len(self.baselines) + 1
         theta = self.start.theta
         for row in self.rows[1:]:
+            was_evaluated = not isnan(row["greedy_J"])
             # The same θ once more is not run again.
-            if not isnan(row["greedy_J"]) and not np.array_equal(row.parameters.theta, theta):
+            has_moved = not np.array_equal(row.parameters.theta, theta)
+            if was_evaluated and has_moved:
                 evaluations += 1
                 theta = row.parameters.theta
         return evaluations * run.evaluation_seeds * run.evaluation_steps
@@ -183,7 +191,9 @@ class Training(Result):
         """
         total = 0.0
         count = 0.0
-        for row, before in zip(self.rows[:0:-1], self.rows[-2::-1], strict=True):
+        # The latest interval first, back to the one that moved θ.
+        last_first = list(reversed(self.rows))
+        for row, before in pairwise(last_first):
             if row["updates"]:
                 break
             samples = row["samples"] - before["samples"]
@@ -208,7 +218,8 @@ class Training(Result):
         """The columns of the training's log, (K,) each, NaN where not measured."""
         columns = {}
         for name in self.rows[0]:
-            columns[name] = np.array([row[name] for row in self.rows])
+            values = [row[name] for row in self.rows]
+            columns[name] = np.array(values)
         return columns
 
     def theta(self) -> dict[str, Array]:
@@ -227,8 +238,10 @@ class Training(Result):
         # Each entry of θ in units of its own scale.
         scaled = {}
         for name, values in self.theta().items():
-            scaled[name] = values / blocks.scale[blocks.slices[name]]
-        end = self.status.partition(":")[0]
+            scale = blocks.scale[blocks.slices[name]]
+            scaled[name] = values / scale
+        # A title has no room for the reason.
+        end, _, _ = self.status.partition(":")
         return training_figure(
             self.log(),
             scaled,
@@ -265,7 +278,8 @@ class Training(Result):
         seed = 2 * HELD_OUT + run.seed
         # The start is in every frame already.
         rows = self.rows[1:]
-        every = -(-len(rows) // frames)
+        every = ceil(len(rows) / frames)
+        start_name = Path(run.start).stem
         runs = {}
         with FmuPlant(run.scenario) as plant:
             law = measured(run.scenario, policy)
@@ -274,7 +288,7 @@ class Training(Result):
                 policy.theta = row.parameters.theta
                 title = f"after {row['samples']:.0f} samples"
                 runs[title] = simulate(plant, law, steps, seed)
-        return animation(Path(run.start).stem, first, run.algorithm, runs, path)
+        return animation(start_name, first, run.algorithm, runs, path)
 
     def save(self, folder: str | Path) -> Path:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""
@@ -376,6 +390,7 @@ def train(
     if not isinstance(scenario, Scenario):
         scenario = Scenario.load(scenario)
     if isinstance(options.get("start"), Path):
+        # The run's identity is JSON, which has no paths.
         options["start"] = str(options["start"])
     run = make_run(algorithm, scenario, samples, settings, TrainingOptions(**options))
     # Regret needs J*, which is solved for once and stored.
@@ -415,6 +430,7 @@ def run_training(
     clock = time.perf_counter()
     if hasattr(progress, "start"):
         progress.start(run)
+    algorithm = rule or load_algorithm(run.algorithm)
     best = build_controller(optimum, run.scenario) if optimum else None
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -430,8 +446,9 @@ def run_training(
         FmuPlant(run.scenario) as plant,
         FmuPlant(run.scenario) as evaluation_plant,
     ):
-        session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
+        session = _Session(run, algorithm, plant, folder)
         compile_functions(session.loop.controller, run.samples)
+        # Without a folder, too: it restarts the solver, and no digit may depend on a folder.
         if resume:
             session.load()
         else:
@@ -441,19 +458,21 @@ def run_training(
             # A function of the user's gets the rows of the log, a bar moves between them.
             status = session.run_to_the_end(evaluator, report, between=progress is True)
         learned = session.loop.parameters
+        trained = session.loop.algorithm
+        predicted_cost = getattr(trained, "predicted_cost", nan)
         training = Training(
             run=run,
             learned=learned,
             rows=session.rows,
             evaluation=evaluator.evaluate(learned.theta),
             status=status,
-            requires=session.loop.algorithm.requires,
+            requires=trained.requires,
             plant_samples=session.loop.counts.number,
             start=session.start,
             start_J=evaluator.start["J"],
             baselines=evaluator.baselines,
-            predicted_cost=float(getattr(session.loop.algorithm, "predicted_cost", nan)),
-            changes=getattr(session.loop.algorithm, "changes", None),
+            predicted_cost=float(predicted_cost),
+            changes=getattr(trained, "changes", None),
             functions=functions_of(session.loop.controller),
             without_checkpoint=session.without_checkpoint,
             wall_seconds=time.perf_counter() - clock,
@@ -470,6 +489,7 @@ class _Remark(dict[str, float]):
     """The last value of each column of the log, and the remark behind a bar made of them."""
 
     def __call__(self, done: int, row: LogRow) -> tuple[int, str]:
+        # What a row does not measure stays as it was measured last.
         for name, value in row.items():
             if not isnan(value):
                 self[name] = value
@@ -610,8 +630,9 @@ class _Session:
         costs = [other["greedy_J"] for other in self.rows[1:]]
         evaluations = [cost for cost in costs if isfinite(cost)]
         # One bad evaluation may be noise, two are not.
-        once = len(evaluations) < 2 or evaluations[-2] <= limit
-        if once and row["samples"] < self.run.samples:
+        is_first_bad_one = len(evaluations) < 2 or evaluations[-2] <= limit
+        goes_on = row["samples"] < self.run.samples
+        if is_first_bad_one and goes_on:
             return None
         reason = f"greedy J = {shown(greedy)} exceeds {shown(limit)}"
         return f"diverged: {reason} at sample {int(row['samples'])}"
@@ -660,11 +681,14 @@ class _Session:
 
     def _restore(self, state: State) -> None:
         """Put log, plant and loop back as a checkpoint has them."""
+        metrics_of_rows = state["rows"].tolist()
+        theta_of_rows = state["row_thetas"]
         self.rows = []
-        for values, theta in zip(state["rows"].tolist(), state["row_thetas"], strict=True):
+        for values, theta in zip(metrics_of_rows, theta_of_rows, strict=True):
             metrics = dict(zip(LOG_COLUMNS, values, strict=True))
             parameters = self.start.with_theta(theta)
-            self.rows.append(LogRow(metrics, parameters))
+            row = LogRow(metrics, parameters)
+            self.rows.append(row)
         snapshot = self.plant.deserialise(state["plant"].tobytes())
         self.plant.restore(snapshot)
         # The loop last: it reads the plant's state.

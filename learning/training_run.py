@@ -46,9 +46,17 @@ from learning.retreat import Retreat
 STARTS = ("naive", "tuned", "backed-off", "cautious")
 CARRIERS = ("rti", "converged")
 """Controllers that can carry θ."""
-OPTION_KINDS: dict[str, type] = {"int": Integral, "float": Real, "str": str}
+OPTION_KINDS: dict[str, type] = {
+    "int": Integral,
+    "float": Real,
+    "str": str,
+}
 """Types that stand for a field's, NumPy's numbers among them."""
-WORDS = {"int": "a whole number", "float": "a number", "str": "a text"}
+WORDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text",
+}
 """The same in messages."""
 HELD_OUT_SHARE = 10
 """Training samples per held-out sample, at least, on a plant that may be slow."""
@@ -102,12 +110,16 @@ class TrainingRun(TrainingOptions):
     def identity(self) -> dict[str, Any]:
         """The run as JSON-ready values, with the hashes of all code that its result depends on."""
         # All attributes: whatever differs makes another run.
-        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        values: dict[str, Any] = {}
+        for option in fields(self):
+            values[option.name] = getattr(self, option.name)
         values["scenario"] = self.scenario.hash
         values["configuration"] = self.configuration.model_dump(mode="json")
         file = Path(self.start)
         if file.is_file():
-            values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+            # By its content: the same name may hold another θ tomorrow.
+            digest = hashlib.sha256(file.read_bytes())
+            values["start"] = digest.hexdigest()[:16]
         values["source"] = depends_on(self.scenario, self.algorithm)
         return values
 
@@ -115,11 +127,13 @@ class TrainingRun(TrainingOptions):
         """θ where the run starts; raises what the function `starting_parameters` raises."""
         start = self._starting_parameters()
         table = self.scenario.estimator or EstimatorTable()
-        if not getattr(self.configuration, "noise", False) or table.kind != "ekf":
+        learns_noise = getattr(self.configuration, "noise", False)
+        has_filter = bool(self.scenario.sensors) and table.kind == "ekf"
+        # Variances without a filter that reads them would be entries of θ without an effect.
+        if not learns_noise or not has_filter:
             return start
-        if not self.scenario.sensors:
-            return start
-        return ExtendedKalmanFilter.from_scenario(self.scenario).add_noise(start)
+        estimator = ExtendedKalmanFilter.from_scenario(self.scenario)
+        return estimator.add_noise(start)
 
     def _starting_parameters(self) -> Parameters:
         """The same without a block `noise`, but for that of a file."""
@@ -198,7 +212,9 @@ def _with_held_out_runs(
     assert options.evaluate_every is not None
     # Of θ after so many samples; at the end, of the start, of naive, and of the optimum if known.
     evaluations = (samples - 1) // options.evaluate_every + 4
-    steps = samples // HELD_OUT_SHARE // (evaluations * options.evaluation_seeds)
+    n_runs = evaluations * options.evaluation_seeds
+    held_out_samples = samples // HELD_OUT_SHARE
+    steps = held_out_samples // n_runs
     if steps < SHORTEST:
         return replace(options, evaluation_seeds=0, evaluation_steps=EVALUATION_STEPS)
     return replace(options, evaluation_steps=min(steps, EVALUATION_STEPS))
@@ -223,12 +239,13 @@ def _check_options(options: TrainingOptions) -> None:
         if value is None and alternative == "None":
             continue
         # Python's bool is an integer, a TOML file's is not.
-        if isinstance(value, bool) or not isinstance(value, OPTION_KINDS[kind]):
+        is_of_kind = isinstance(value, OPTION_KINDS[kind]) and not isinstance(value, bool)
+        if not is_of_kind:
             raise ConfigurationError(
                 f"training: {option.name} must be {WORDS[kind]}, not {value!r:.60}"
             )
         if option.name in ranges:
-            _check_range(option.name, getattr(options, option.name), ranges[option.name])
+            _check_range(option.name, value, ranges[option.name])
     if options.controller not in CARRIERS:
         raise ConfigurationError(
             f"training: there is no controller '{options.controller}'; there are rti and converged"
@@ -282,11 +299,13 @@ def begin_training(
     if run.scenario.sensors:
         algorithm = getattr(algorithm, "under_sensors", algorithm)
     # Each source of randomness has its own stream, so that settings keep runs paired.
-    controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
+    start = run.starting_parameters()
+    controller = nmpc(run.scenario, start, run.controller)
     strategy = Strategy(run.configuration, run.scenario)
     plant_seed, rng = spawn_seeds(run.seed)
     # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
-    third_child = np.random.SeedSequence(run.seed).spawn(3)[2]
+    seed_sequence = np.random.SeedSequence(run.seed)
+    _, _, third_child = seed_sequence.spawn(3)
     algorithm_rng = np.random.default_rng(third_child)
     rule = algorithm(
         controller,
@@ -350,11 +369,15 @@ def starting_parameters(
         ParameterError: a bad file.
         TuningError: the tuning fails.
     """
+    # A word close to a start's is a slip, where there is no file of that name.
     meant = suggestion(start, STARTS)
     if start not in STARTS and meant and not Path(start).exists():
         raise ConfigurationError(f"there is no start '{start}'{meant}, nor such a parameters file")
-    file = None if start in ("naive", "tuned") else Parameters.load(start, problem)
-    if file is not None and "w_sigma" in file.blocks and configuration.parametrisation == "paper":
+    file = None
+    if start not in ("naive", "tuned"):
+        file = Parameters.load(start, problem)
+    has_slack_weights = file is not None and "w_sigma" in file.blocks
+    if has_slack_weights and configuration.parametrisation == "paper":
         raise ConfigurationError(
             f"{start}: θ has slack weights, which the parametrisation 'paper' has not; set "
             "parametrisation=extended"
@@ -375,7 +398,7 @@ def starting_parameters(
         model_parameters=tuple(labels),
         noise=noise,
     )
-    # Blocks that the start does not say begin at values of the problem's scale.
+    # What a file does not say begins as with `naive`.
     if start == "tuned":
         theta = tune(problem, blocks).parameters
     else:
@@ -384,7 +407,9 @@ def starting_parameters(
         # The level of V is that of the TD error's discount.
         discount: float | None = getattr(configuration, "discount", None)
         theta = theta.replace({"c_lambda": problem.value_level(discount)})
+    # At their scale the penalty is exact (`Units`).
     for name in ("w_sigma", "W_sigma"):
         if name in blocks:
-            theta = theta.replace({name: blocks.scale[blocks.slices[name]]})
+            scale = blocks.scale[blocks.slices[name]]
+            theta = theta.replace({name: scale})
     return theta if file is None else file.placed_in(theta)

@@ -134,7 +134,7 @@ def solve_stabilised(stages: Stages, xi_0: Vector) -> QpSolution:
     n_controls = horizon * m
     n_soft = horizon * n
     feedback = _riccati(stages)
-    responses = _respond(stages, feedback, xi_0)
+    responses = _simulate_responses(stages, feedback, xi_0)
     free_controls = responses.free_controls
     free_states = responses.free_states
 
@@ -187,7 +187,7 @@ class _Responses:
     free_states: Vector
 
 
-def _respond(stages: Stages, feedback: _Feedback, xi_0: Vector) -> _Responses:
+def _simulate_responses(stages: Stages, feedback: _Feedback, xi_0: Vector) -> _Responses:
     """Simulate v_k = K_k ξ_k + c_k from ξ_0, for each entry of c and for none."""
     horizon, n, m = stages.B.shape
     n_controls = horizon * m

@@ -14,7 +14,7 @@ import numpy as np
 from controllers.errors import ModelError
 from controllers.problem import Problem
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
-from controllers.varying import VaryingKind, of_kind
+from controllers.varying import of_kind
 from cosim.core.protocols import Vector
 
 
@@ -137,11 +137,8 @@ def true_bounds(problem: Problem, symbols: Symbols) -> tuple[ca.SX, ca.SX] | Non
     """
     if not of_kind(problem.varying, "lower", "upper"):
         return None
-    state_lower = ca.SX(ca.DM(problem.state_lower))
-    state_upper = ca.SX(ca.DM(problem.state_upper))
-    lower = _moved(problem, symbols, "lower", state_lower)
-    upper = _moved(problem, symbols, "upper", state_upper)
-    # The present state is that of stage 0.
+    lower = _moved(problem, symbols, "lower", ca.SX(ca.DM(problem.state_lower)))
+    upper = _moved(problem, symbols, "upper", ca.SX(ca.DM(problem.state_upper)))
     return lower[0], upper[0]
 
 
@@ -151,14 +148,9 @@ def moved_references(problem: Problem, symbols: Symbols) -> list[ca.SX]:
     return _moved(problem, symbols, "reference", still)
 
 
-def _moved(
-    problem: Problem,
-    symbols: Symbols,
-    kind: VaryingKind,
-    start: ca.SX,
-) -> list[ca.SX]:
+def _moved(problem: Problem, symbols: Symbols, kind: str, start: ca.SX) -> list[ca.SX]:
     """A vector at the stages 0 … N, moved by the varying quantities of a kind."""
-    moving = of_kind(problem.varying, kind)
+    moving = of_kind(problem.varying, kind)  # type: ignore[arg-type]
     n_stages = problem.horizon + 1
     if not moving:
         # One expression for all of them: its C is that of a problem where nothing varies.

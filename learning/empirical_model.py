@@ -352,11 +352,9 @@ class _Regression:
         self._inputs = inputs
         self._outputs = outputs
         self._settings = settings
-        centre = inputs.mean(axis=0)
-        spread = inputs.std(axis=0)
-        # An input that never moved has no slope: any unit serves.
-        unit = np.where(spread > 0, spread, 1.0)
-        self.standardisation = Standardisation(centre, unit)
+        unit = inputs.std(axis=0)
+        unit = np.where(unit > 0, unit, 1.0)
+        self.standardisation = Standardisation(inputs.mean(axis=0), unit)
 
     def equations(
         self,
@@ -375,8 +373,7 @@ class _Regression:
         design, target = self._linearised(c, rows)
         if persistence.any():
             # What persists of the error before is no news (Cochrane and Orcutt 1949).
-            rows_before = rows[1:] - 1
-            design_before, target_before = self._linearised(c, rows_before)
+            design_before, target_before = self._linearised(c, rows[1:] - 1)
             design = design[1:] - persistence @ design_before
             target = target[1:] - target_before @ persistence.T
         return design, target
@@ -399,11 +396,7 @@ class _Regression:
         rows = self._samples(step)
         errors = self._errors(mean, rows)
         # Of consecutive samples the errors before are at hand.
-        if step == 1:
-            before = errors[:-1]
-        else:
-            rows_before = rows[1:] - 1
-            before = self._errors(mean, rows_before)
+        before = errors[:-1] if step == 1 else self._errors(mean, rows[1:] - 1)
         persistence = estimate_persistence(
             errors[1:],
             before,

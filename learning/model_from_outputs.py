@@ -56,7 +56,6 @@ class ModelFromOutputs(Algorithm):
                 "and noise=false"
             )
         self._filter = ExtendedKalmanFilter.from_scenario(self.scenario, differentiates=True)
-        # What the scenario says of the variances, before a sample.
         self._prior_mean = self._filter.noise
         self._plant = FittedPlant(self.scenario, start, settings.normal_errors)
         problem = Problem.from_scenario(self.scenario)

@@ -154,7 +154,11 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     )
 
 
-def _active_bound(problem: Problem, i: int, multiplier: float) -> str:
+def _active_bound(
+    problem: Problem,
+    i: int,
+    multiplier: float,
+) -> str:
     """The active bound of entry i of (x, u) in words; TuningError where it would be violated."""
     model = problem.model
     quantities = (*model.states, *model.actions)
@@ -284,7 +288,11 @@ class Convexification:
     beta: float
 
 
-def rotation(A: Array, B: Array, delta_P: Array) -> Array:
+def rotation(
+    A: Array,
+    B: Array,
+    delta_P: Array,
+) -> Array:
     """𝓗(δP) = [A B]ᵀ δP [A B] − [I 0]ᵀ δP [I 0]: the storage ½xᵀδPx as a stage cost.
 
     Args:
@@ -566,7 +574,11 @@ def _local_tuning(problem: Problem, steady: SteadyState) -> LocalTuning:
     return LocalTuning(convex, C, economic, tuned, P, None)
 
 
-def _augmented_tuning(problem: Problem, steady: SteadyState, reason: str) -> LocalTuning:
+def _augmented_tuning(
+    problem: Problem,
+    steady: SteadyState,
+    reason: str,
+) -> LocalTuning:
     """The tuning of the economic cost with the least quadratic added; TuningError if none helps.
 
     All is computed in w_i / range_i: there one σ serves every variable, and a change of units

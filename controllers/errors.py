@@ -46,7 +46,13 @@ class QpError(ControllerError):
 
     is_solver_failure: ClassVar[bool] = True
 
-    def __init__(self, message: str, *, status: str, qp: Any = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        *,
+        status: str,
+        qp: Any = None,
+    ) -> None:
         super().__init__(message)
         self.status = status
         self.qp = qp

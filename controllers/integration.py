@@ -112,7 +112,12 @@ class _Predictor:
         eigenvalues = np.linalg.eigvals(usable)
         return eigenvalues.astype(complex)
 
-    def __call__(self, x: Matrix, u: Matrix, substeps: int) -> Matrix:
+    def __call__(
+        self,
+        x: Matrix,
+        u: Matrix,
+        substeps: int,
+    ) -> Matrix:
         """x₊ and its derivatives by (x, u) side by side, (P, n, 1+n+m)."""
         count, n = x.shape
         m = u.shape[1]

@@ -41,7 +41,13 @@ def torch_layer(controller: RtiNmpc) -> Layer:
 
     class RtiNmpcFunction(torch.autograd.Function):  # type: ignore[misc,name-defined]
         @staticmethod
-        def forward(ctx: Any, states: Any, theta: Any, enforced: Any, points: Any) -> Any:
+        def forward(
+            ctx: Any,
+            states: Any,
+            theta: Any,
+            enforced: Any,
+            points: Any,
+        ) -> Any:
             # Derivatives take several times the solution: only where somebody asks.
             needed = any(ctx.needs_input_grad)
             solution = controller.feedback_batch(
@@ -65,7 +71,11 @@ def torch_layer(controller: RtiNmpc) -> Layer:
 
         @staticmethod
         @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
-        def backward(ctx: Any, by_action: Any, by_value: Any) -> Any:
+        def backward(
+            ctx: Any,
+            by_action: Any,
+            by_value: Any,
+        ) -> Any:
             gradients = _pull_back(
                 torch.einsum,
                 ctx.saved_tensors,
@@ -77,7 +87,12 @@ def torch_layer(controller: RtiNmpc) -> Layer:
             # The points are held.
             return *gradients, None
 
-    def layer(states: Any, theta: Any, enforced: Any = None, points: Any = None) -> Any:
+    def layer(
+        states: Any,
+        theta: Any,
+        enforced: Any = None,
+        points: Any = None,
+    ) -> Any:
         return RtiNmpcFunction.apply(states, theta, enforced, points)
 
     return layer
@@ -147,7 +162,12 @@ def jax_layer(controller: RtiNmpc) -> Layer:
         return *gradients, by_points
 
     @jax.custom_vjp  # type: ignore[untyped-decorator]
-    def layer(states: Any, theta: Any, enforced: Any = None, points: Any = None) -> Any:
+    def layer(
+        states: Any,
+        theta: Any,
+        enforced: Any = None,
+        points: Any = None,
+    ) -> Any:
         return solve(False, states, theta, enforced, points)
 
     layer.defvjp(forward, backward)

@@ -297,7 +297,12 @@ class Model:
             outputs[output] = checked
         object.__setattr__(self, "outputs", outputs)
 
-    def _checked(self, name: str, function: object, rows: int) -> ModelFunction:
+    def _checked(
+        self,
+        name: str,
+        function: object,
+        rows: int,
+    ) -> ModelFunction:
         """A function of the model that returns a column of so many rows; raises ModelError."""
         if not callable(function):
             raise ModelError(
@@ -488,7 +493,11 @@ def runge_kutta(
     return x
 
 
-def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function:
+def discretise(
+    model: Model,
+    sampling_time: float,
+    substeps: int,
+) -> ca.Function:
     """Discrete-time model f(x, u, d, p) → x₊ for inputs held over one sample.
 
     Args:

@@ -125,7 +125,11 @@ def keep(key: str, optimum: Optimum) -> Path:
     return write_optimum(cache_folder("optima") / f"{key}.npz", optimum, key)
 
 
-def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
+def write_optimum(
+    path: Path,
+    optimum: Optimum,
+    key: str,
+) -> Path:
     """Write a solved problem as a compressed .npz; equal content gives equal bytes.
 
     Args:
@@ -495,7 +499,11 @@ def _jumps(scenario: Scenario, changes: Sequence[ChangeTable]) -> Change:
     )
 
 
-def frozen(scenario: Scenario, name: str, value: float) -> Scenario:
+def frozen(
+    scenario: Scenario,
+    name: str,
+    value: float,
+) -> Scenario:
     """The scenario without fouling, its fouled parameter at a value.
 
     Args:
@@ -512,7 +520,11 @@ def frozen(scenario: Scenario, name: str, value: float) -> Scenario:
     return Scenario.from_dict(document)
 
 
-def _parameter(scenario: Scenario, model: Model, name: str) -> float:
+def _parameter(
+    scenario: Scenario,
+    model: Model,
+    name: str,
+) -> float:
     """A plant parameter as the scenario sets it, else as the plant's model has it."""
     (index,) = model.parameter_indices((name,))
     nominal = model.nominal_parameters[index]

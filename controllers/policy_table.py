@@ -26,7 +26,12 @@ class PolicyTable:
         values: of the grid's states, (K,).
     """
 
-    def __init__(self, axes: Sequence[Array], actions: Array, values: Array) -> None:
+    def __init__(
+        self,
+        axes: Sequence[Array],
+        actions: Array,
+        values: Array,
+    ) -> None:
         self.axes = axes
         self.rows = np.column_stack([actions, values])
         # Python's numbers: for a few states they are faster than arrays.
@@ -170,7 +175,12 @@ class CompiledTable:
             return None
         return cls(str(path), table, penalty, limits)
 
-    def __call__(self, plant: Any, first: int, rows: Array) -> tuple[int, int, int]:
+    def __call__(
+        self,
+        plant: Any,
+        first: int,
+        rows: Array,
+    ) -> tuple[int, int, int]:
         """Run samples of the loop (`cosim.core.protocols.CompiledLoop`)."""
         fault = (ctypes.c_int * 2)()
         reached = self._run(

@@ -302,7 +302,11 @@ def _power(size: ArrayLike) -> Vector:
     return np.asarray(np.clip(power, -50.0, 50.0))
 
 
-def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
+def _frozen(
+    name: str,
+    values: ArrayLike,
+    size: int,
+) -> Vector:
     """A copy that cannot be written to: a frozen problem stays as it was checked."""
     try:
         array = np.array(values, dtype=np.float64)

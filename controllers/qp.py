@@ -220,7 +220,11 @@ class QpSolution(NamedTuple):
         return float(singular_values[-1])
 
 
-def _projected(values: Vector, lower: Vector, upper: Vector) -> Vector:
+def _projected(
+    values: Vector,
+    lower: Vector,
+    upper: Vector,
+) -> Vector:
     """Projection of values on the box between the limits."""
     return np.minimum(np.maximum(values, lower), upper)
 
@@ -353,7 +357,11 @@ MAX_NEWTON_STEPS = 10
 """Most Newton steps of `polish`; two or three are the rule."""
 
 
-def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-12) -> QpSolution:
+def polish(
+    qp: SoftQp,
+    solution: QpSolution,
+    accuracy: float = 1e-12,
+) -> QpSolution:
     """Bring an approximate solution to a residual below `accuracy` by a few Newton steps.
 
     Each step solves exactly for the iterate's active set (a primal-dual active-set method, that is

@@ -187,7 +187,11 @@ class _Responses:
     free_states: Vector
 
 
-def _simulate_responses(stages: Stages, feedback: _Feedback, xi_0: Vector) -> _Responses:
+def _simulate_responses(
+    stages: Stages,
+    feedback: _Feedback,
+    xi_0: Vector,
+) -> _Responses:
     """Simulate v_k = K_k ξ_k + c_k from ξ_0, for each entry of c and for none."""
     horizon, n, m = stages.B.shape
     n_controls = horizon * m

@@ -90,7 +90,11 @@ def symbolic_stage(problem: Problem, blocks: ThetaBlocks) -> Symbols:
     return symbols
 
 
-def stage_columns(problem: Problem, blocks: ThetaBlocks, given: ca.MX) -> ca.MX:
+def stage_columns(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    given: ca.MX,
+) -> ca.MX:
     """What the functions of the stages 0 … N−1 are given in the place of θ, side by side.
 
     Args:
@@ -148,7 +152,12 @@ def moved_references(problem: Problem, symbols: Symbols) -> list[ca.SX]:
     return _moved(problem, symbols, "reference", still)
 
 
-def _moved(problem: Problem, symbols: Symbols, kind: str, start: ca.SX) -> list[ca.SX]:
+def _moved(
+    problem: Problem,
+    symbols: Symbols,
+    kind: str,
+    start: ca.SX,
+) -> list[ca.SX]:
     """A vector at the stages 0 … N, moved by the varying quantities of a kind."""
     moving = of_kind(problem.varying, kind)  # type: ignore[arg-type]
     n_stages = problem.horizon + 1

@@ -453,7 +453,12 @@ class Parameters(Shown):
         return cls.from_toml(text, problem, path)
 
     @classmethod
-    def from_toml(cls, text: str, problem: Problem, path: str | Path) -> Parameters:
+    def from_toml(
+        cls,
+        text: str,
+        problem: Problem,
+        path: str | Path,
+    ) -> Parameters:
         """Read θ from a file's text, as `load` does.
 
         Args:
@@ -497,7 +502,11 @@ class Parameters(Shown):
 Symbols = dict[str, ca.SX]
 
 
-def symbolic_theta(problem: Problem, blocks: ThetaBlocks, behind: int = 0) -> Symbols:
+def symbolic_theta(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    behind: int = 0,
+) -> Symbols:
     """Symbol `theta` (n_θ,), its blocks by name, and `model_parameters` (n_p,) with θ's own in it.
 
     A slack weight that is no block is the problem's constant.

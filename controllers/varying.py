@@ -56,7 +56,11 @@ def varying_quantities(scenario: Scenario, model: Model) -> tuple[Varying, ...]:
     return tuple(quantities)
 
 
-def _of_model(table: SignalTable, name: str, model: Model) -> Varying:
+def _of_model(
+    table: SignalTable,
+    name: str,
+    model: Model,
+) -> Varying:
     """The disturbance or parameter of a model that a signal is; raises ModelError."""
     disturbances = [quantity.name for quantity in model.disturbances]
     parameters = [quantity.name for quantity in model.parameters]
@@ -89,7 +93,11 @@ def _bound(table: SignalTable, scenario: Scenario) -> Varying:
     return Varying(table.name, kind, index, nominal)
 
 
-def _reference(table: SignalTable, name: str, scenario: Scenario) -> Varying:
+def _reference(
+    table: SignalTable,
+    name: str,
+    scenario: Scenario,
+) -> Varying:
     """The reference of a state or an action that a signal is."""
     plant = scenario.plant
     names = [*plant.states, *plant.actions]

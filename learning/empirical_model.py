@@ -328,7 +328,12 @@ class Standardisation(NamedTuple):
     centre: Array
     unit: Array
 
-    def design(self, features: Features, inputs: Array, c: Array) -> _Design:
+    def design(
+        self,
+        features: Features,
+        inputs: Array,
+        c: Array,
+    ) -> _Design:
         """The model at inputs (M, n+m) about parameters c (p,)."""
         y, G, h = features(inputs, c)
         standardised = (inputs - self.centre) / self.unit

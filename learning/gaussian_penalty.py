@@ -56,7 +56,11 @@ def expected_penalties_with_errors(
     return penalties
 
 
-def normal_penalties(penalty: Penalty, means: Array, variances: Array) -> Array:
+def normal_penalties(
+    penalty: Penalty,
+    means: Array,
+    variances: Array,
+) -> Array:
     """E[b v + B v²] of each bound, the state normal about its estimate.
 
     With z = (x_l − μ)/σ the violation of a lower bound has E[v] = σ(zΦ(z) + φ(z)) and

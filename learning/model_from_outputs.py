@@ -297,7 +297,12 @@ class FittedPlant:
             self._tables.append(fitted)
         self._seed = seed
 
-    def run(self, theta: Parameters, n_samples: int, burn_in: int) -> SimulatedCost:
+    def run(
+        self,
+        theta: Parameters,
+        n_samples: int,
+        burn_in: int,
+    ) -> SimulatedCost:
         """The mean cost of a rollout at θ.
 
         Args:

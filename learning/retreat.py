@@ -44,7 +44,11 @@ class ShownCost(NamedTuple):
         return float(of_a_batch / len(self.batches))
 
 
-def exceeds(one: ShownCost, other: ShownCost, probability: float) -> bool:
+def exceeds(
+    one: ShownCost,
+    other: ShownCost,
+    probability: float,
+) -> bool:
     """Whether a cost is above another one by Welch's test.
 
     Args:
@@ -64,7 +68,11 @@ def exceeds(one: ShownCost, other: ShownCost, probability: float) -> bool:
     return bool(test.pvalue < probability)
 
 
-def exceeds_prediction(cost: ShownCost, predicted: float, probability: float) -> bool:
+def exceeds_prediction(
+    cost: ShownCost,
+    predicted: float,
+    probability: float,
+) -> bool:
     """Whether a cost is above a predicted one by Student's test; not where none is predicted.
 
     Args:

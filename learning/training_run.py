@@ -259,7 +259,11 @@ def _check_samples(samples: int) -> None:
     _check_range("samples", samples, Range(1, MOST))
 
 
-def _check_range(name: str, value: float, limits: Range) -> None:
+def _check_range(
+    name: str,
+    value: float,
+    limits: Range,
+) -> None:
     """Refuse a number outside its range by ConfigurationError."""
     if name == "seed" and value >= HELD_OUT:
         raise ConfigurationError(

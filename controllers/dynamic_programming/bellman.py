@@ -424,7 +424,12 @@ class BellmanOperator:
                 total[above] += penalty
         return total
 
-    def _expected_bound_penalty(self, x: Array, i: int, sign: float) -> Array:
+    def _expected_bound_penalty(
+        self,
+        x: Array,
+        i: int,
+        sign: float,
+    ) -> Array:
         """Expected penalty of one bound of state i, whose values are x (B, q) at the nodes.
 
         The bound is the upper one for `sign` 1, the lower one for −1. A state is smooth in the

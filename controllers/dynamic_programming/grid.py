@@ -225,7 +225,11 @@ class Grid:
         return interpolants
 
 
-def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
+def _horner(
+    table: Array,
+    index: Indices,
+    offsets: Sequence[Array],
+) -> Array:
     """Polynomial in `offsets` of the coefficients `table[i, j, …, index]`, by Horner's rule."""
     if not offsets:
         return np.asarray(table[index])

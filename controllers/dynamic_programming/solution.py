@@ -158,7 +158,11 @@ def refined(
     return start_policy(operator, finer, actions, share=0.1)
 
 
-def _support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:
+def _support(
+    axis: Array,
+    mass: Array,
+    tail: float,
+) -> tuple[float, float]:
     """Interval that holds all but `tail` of the mass at each end, and a cell on either side."""
     # A cell more on either side: the mass stands at points for what is between them.
     cumulative = np.cumsum(mass) / mass.sum()

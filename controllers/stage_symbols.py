@@ -152,12 +152,7 @@ def moved_references(problem: Problem, symbols: Symbols) -> list[ca.SX]:
     return _moved(problem, symbols, "reference", still)
 
 
-def _moved(
-    problem: Problem,
-    symbols: Symbols,
-    kind: str,
-    start: ca.SX,
-) -> list[ca.SX]:
+def _moved(problem: Problem, symbols: Symbols, kind: str, start: ca.SX) -> list[ca.SX]:
     """A vector at the stages 0 … N, moved by the varying quantities of a kind."""
     moving = of_kind(problem.varying, kind)  # type: ignore[arg-type]
     n_stages = problem.horizon + 1

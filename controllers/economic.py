@@ -93,7 +93,9 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     f = discretise(model, problem.sampling_time, problem.substeps)
     x_next = f(x, u, d, p)
     change = x_next - x
-    cost = model.economic_cost(x, u, ca.SX(d), ca.SX(p))
+    nominal_d = ca.SX(d)
+    nominal_p = ca.SX(p)
+    cost = model.economic_cost(x, u, nominal_d, nominal_p)
     w = ca.vertcat(x, u)
     # Bounds are not relaxed: the active ones are read off the solution.
     options: dict[str, Any] = {
@@ -125,11 +127,13 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     # What is left of the gradient of cost and dynamics are the bounds' multipliers.
     point = solution["x"].full().reshape(-1)
     costate = solution["lam_g"].full().reshape(-1)
-    lagrangian = cost + ca.dot(ca.SX(ca.DM(costate)), change)
+    costate_as_numbers = ca.SX(ca.DM(costate))
+    lagrangian = cost + ca.dot(costate_as_numbers, change)
     hessian, gradient = ca.hessian(lagrangian, w)
     jacobian = ca.jacobian(x_next, w)
     derivatives = ca.Function("d", [w], [hessian, gradient, jacobian])
-    hessian, gradient, jacobian = (value.full() for value in derivatives(point))
+    values = derivatives(point)
+    hessian, gradient, jacobian = (value.full() for value in values)
     multipliers = gradient.reshape(-1)
 
     # A bound that does not push takes no freedom from the feedback.
@@ -231,7 +235,8 @@ def local_feedback(
     if spectral_radius >= 1:
         raise TuningError("the active constraints, once kept, make the closed loop unstable")
     # P = stage + closedᵀ P closed: the Riccati solver's P is accurate in the gain's part only.
-    along = np.vstack([np.eye(n), gain])
+    identity = np.eye(n)
+    along = np.vstack([identity, gain])
     stage = along.T @ H @ along
     P = solve_discrete_lyapunov(closed_loop.T, stage, method="direct")
     return gain, _symmetric(P)
@@ -248,7 +253,9 @@ def _unconstrained_feedback(
     n = len(A)
     count = free.shape[1]
     # In the free variables: (x, u) = change (x, v).
-    state_rows = [np.eye(n), np.zeros((n, count))]
+    identity = np.eye(n)
+    zeros = np.zeros((n, count))
+    state_rows = [identity, zeros]
     action_rows = [gain, free]
     change = np.block([state_rows, action_rows])
     reduced = change.T @ H @ change
@@ -338,16 +345,12 @@ def convexify(
     n_F = len(F_basis)
 
     # The convexified Hessian is linear in α, δP and F: a column each.
-    # In `svec` the cone of positive semidefinite matrices is Clarabel's.
-    rotations = [rotation(A, B, unit) for unit in _symmetric_basis(n)]
-    forces = [C.T @ unit @ C for unit in F_basis]
-    terms = [H, *rotations, *forces]
-    columns = np.stack([svec(term) for term in terms], axis=1)
+    columns = _hessian_columns(H, A, B, C)
     triangle, count = columns.shape
     identity = svec(np.eye(size))[:, None]
     zeros = np.zeros((triangle, 1))
 
-    # Variables: α, δP, F, β, t with t ≥ ‖F‖.
+    # Variables: α, δP, F, β, t with t ≥ ‖F‖; β and t are no part of the Hessian.
     n_variables = count + 2
     F_place = slice(count - n_F, count)
     objective = np.zeros(n_variables)
@@ -366,7 +369,9 @@ def convexify(
     below_beta = np.hstack([columns, -identity, zeros])
     constraints = np.vstack([nonnegative, norm, above_identity, below_beta])
     no_offset = np.zeros(2 + n_F)
-    offset = np.concatenate([no_offset, -identity[:, 0], np.zeros(triangle)])
+    minus_identity = -identity[:, 0]
+    no_offset_below = np.zeros(triangle)
+    offset = np.concatenate([no_offset, minus_identity, no_offset_below])
     cones = [
         clarabel.NonnegativeConeT(1),
         clarabel.SecondOrderConeT(1 + n_F),
@@ -387,24 +392,69 @@ def convexify(
             f"{constraint} (Clarabel: {status}): staying at the steady state is not optimal"
         )
 
+    # Over α, so that H itself has the weight 1.
     alpha = float(z[0])
-    beta = float(z[-2])
     delta_P = symmetric_matrix(z[1 : F_place.start], n) / alpha
     F = symmetric_matrix(z[F_place], n_c) / alpha
-    hessian = _symmetric(H + rotation(A, B, delta_P) + C.T @ F @ C)
+    hessian = _convexified(A, B, H, C, delta_P, F)
     least = np.linalg.eigvalsh(hessian)[0]
     if not least > 0:
         raise TuningError(
             f"the convexified cost is not positive definite (smallest eigenvalue {least:.3g}, "
             f"Clarabel: {status})"
         )
-    return Convexification(hessian, delta_P, F, alpha, beta)
+    return Convexification(hessian, delta_P, F, alpha, beta=float(z[-2]))
+
+
+def _convexified(
+    A: Array,
+    B: Array,
+    H: Array,
+    C: Array,
+    delta_P: Array,
+    F: Array,
+) -> Array:
+    """H + 𝓗(δP) + CᵀFC, (n+m, n+m)."""
+    rotated = rotation(A, B, delta_P)
+    forced = C.T @ F @ C
+    return _symmetric(H + rotated + forced)
+
+
+def _hessian_columns(
+    first: Array,
+    A: Array,
+    B: Array,
+    C: Array,
+) -> Array:
+    """Derivatives of a convexified Hessian by its variables, in `svec`, side by side.
+
+    In `svec` the cone of positive semidefinite matrices is Clarabel's.
+
+    Args:
+        first: Derivative by the first variable, which is α or σ, (n+m, n+m).
+        A: Jacobian of the next state by the state, (n, n).
+        B: Jacobian by the action, (n, m).
+        C: Gradients of the active constraints, (n_c, n+m).
+
+    Returns:
+        A column for the first variable, and for each entry of δP and of F.
+    """
+    n = len(A)
+    n_c = len(C)
+    terms = [first]
+    for unit in _symmetric_basis(n):
+        terms.append(rotation(A, B, unit))
+    for unit in _symmetric_basis(n_c):
+        terms.append(C.T @ unit @ C)
+    columns = [svec(term) for term in terms]
+    return np.stack(columns, axis=1)
 
 
 def _symmetric_basis(size: int) -> list[Array]:
     """Basis of the symmetric matrices: e_ij + e_ji, upper triangle row by row."""
     n_entries = size * (size + 1) // 2
-    return [symmetric_matrix(unit, size) for unit in np.eye(n_entries)]
+    units = np.eye(n_entries)
+    return [symmetric_matrix(unit, size) for unit in units]
 
 
 def least_addition(
@@ -433,10 +483,7 @@ def least_addition(
     """
     size = len(H)
     identity = np.eye(size)
-    rotations = [rotation(A, B, unit) for unit in _symmetric_basis(len(A))]
-    forces = [C.T @ unit @ C for unit in _symmetric_basis(len(C))]
-    terms = [identity, *rotations, *forces]
-    columns = np.stack([svec(term) for term in terms], axis=1)
+    columns = _hessian_columns(identity, A, B, C)
     n_variables = columns.shape[1]
     objective = np.zeros(n_variables)
     objective[0] = 1.0
@@ -739,7 +786,8 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     P = local.value
     # P is the value under γ = 1: what γ < 1 takes of the next state's, the stage cost has too.
     dynamics = np.hstack([steady.A, steady.B])
-    M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
+    taken = 1.0 - problem.discount
+    M = convex.hessian + taken * dynamics.T @ P @ dynamics
     q = steady.multipliers
     if local.addition is not None and local.addition.released:
         # What pushes onto a bound that cannot be kept would make the loop unstable.
@@ -829,7 +877,8 @@ def linearisation_substeps(problem: Problem) -> int:
 def _rounded(block: Array) -> Array:
     """Entries to six digits, 0 below 1e-9 of the largest, without a solver's last bits."""
     # The last bits are the solver's and differ between platforms; θ files must not.
-    least = 1e-9 * float(np.abs(block).max(initial=0.0))
+    largest = float(np.abs(block).max(initial=0.0))
+    least = 1e-9 * largest
     rounded = np.zeros(block.shape)
     for place, x in np.ndenumerate(block):
         if abs(x) > least:

@@ -59,7 +59,12 @@ class QpError(ControllerError):
 
 
 def warn(message: str, category: type[CosimWarning]) -> None:
-    """Warn the user, once for each message."""
+    """Warn the user, once for each message.
+
+    Args:
+        message: One line.
+        category: Class of the warning.
+    """
     warnings.warn_explicit(message, category, category.__module__, 0, registry=_WARNED)
 
 

@@ -170,7 +170,8 @@ def measure_integration(problem: Problem) -> Integration:
     length = predict.length
     widths = problem.upper - problem.lower
     # A derivative counts as what it makes of the whole width of the bounds.
-    scale = np.hstack([1.0, widths]) / widths[:n, None]
+    widths_of_states = widths[:n, None]
+    scale = np.hstack([1.0, widths]) / widths_of_states
     suffices = None
     with np.errstate(all="ignore"):  # a prediction that runs away is a result here
         coarse = predict(x, u, substeps)
@@ -187,7 +188,8 @@ def measure_integration(problem: Problem) -> Integration:
             present = finer
         grows = _grows(modes, length / problem.substeps)
         errors = _errors(coarse, finer, scale, grows)
-    point, state = np.unravel_index(int(errors.argmax()), errors.shape)
+    place = int(errors.argmax())
+    point, state = np.unravel_index(place, errors.shape)
     return Integration(
         error=float(errors.max()),
         state=problem.model.states[state].name,
@@ -270,15 +272,17 @@ def _errors(
 def _finite(values: Matrix) -> Mask:
     """Whether all entries are finite, of each of P points (P, …)."""
     by_point = values.reshape(len(values), -1)
-    finite: Mask = np.array(np.isfinite(by_point).all(axis=1))
-    return finite
+    finite = np.isfinite(by_point)
+    all_finite: Mask = np.array(finite.all(axis=1))
+    return all_finite
 
 
 def _grows(modes: NDArray[np.complex128], h: float) -> Mask:
     """Whether of modes (P, n) one that decays is outside of the stability region of a step h."""
     # The stability function of RK4: what a step makes of a mode.
     z = modes * h
-    growth = np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)
+    factor = 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24
+    growth = np.abs(factor)
     decays = modes.real < 0
     grows_in_steps = growth > 1 + GROWTH_MARGIN
     wrong = decays & grows_in_steps

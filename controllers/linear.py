@@ -71,7 +71,8 @@ class PiLoops:
         self.states = pairing(B)
         # A sample's own dynamics of a state, the others held, are its entry of A's diagonal.
         # The clip gives an integrator a long time constant, and a state without memory a short one.
-        poles = np.clip(np.diag(A), 1e-9, 1.0 - 1e-9)
+        diagonal = np.diag(A)
+        poles = np.clip(diagonal, 1e-9, 1.0 - 1e-9)
         pole = poles[self.states]
         time_constant = -1.0 / np.log(pole)
         # K = τ/k with the steady gain k of an action, that of a sample over 1 − pole.

@@ -181,7 +181,9 @@ def _column(result: Any) -> Any:
     if isinstance(result, list | tuple):
         return ca.vertcat(*result)
     # A comparison that Python has made is a bool, and no cost.
-    if isinstance(result, int | float | np.number) and not isinstance(result, bool):
+    if isinstance(result, bool):
+        return None
+    if isinstance(result, int | float | np.number):
         return ca.SX(float(result))
     return None
 

@@ -235,7 +235,8 @@ class OptimalPolicy:
         self.problem = plant.problem
         self.optimum = optimum
         self._plant = plant
-        self._table = PolicyTable(optimum.grid.axes, optimum.actions, optimum.W)
+        axes = optimum.grid.axes
+        self._table = PolicyTable(axes, optimum.actions, optimum.W)
         self.functions = INTERPRETED
 
     @classmethod
@@ -317,7 +318,8 @@ class OptimalPolicy:
         Raises:
             QpError: s or a is not finite.
         """
-        state: list[float] = np.asarray(s, dtype=np.float64).tolist()
+        array = np.asarray(s, dtype=np.float64)
+        state: list[float] = array.tolist()
         n = self.problem.n_states
         # A finite sum has finite terms: one test in place of n.
         is_usable = len(state) == n and isfinite(sum(state))
@@ -348,8 +350,11 @@ class OptimalPolicy:
         problem = self.problem
         optimum = self.optimum
         m = problem.n_actions
-        state = np.array(s, dtype=np.float64).reshape(1, -1)
-        action = np.array(a, dtype=np.float64).reshape(1, -1)
+        # The operator takes many states at once: a row of each.
+        state = np.array(s, dtype=np.float64)
+        state = state.reshape(1, -1)
+        action = np.array(a, dtype=np.float64)
+        action = action.reshape(1, -1)
         is_usable = action.shape[1] == m and np.isfinite(action).all()
         if not is_usable:
             raise QpError(

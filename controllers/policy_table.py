@@ -108,8 +108,10 @@ class _Native(ctypes.Structure):
 
 def table_sources() -> dict[str, bytes]:
     """C files of the loop of a table and an FMU by name."""
-    names = ("loop.h", "fmu.h", "optimal.c")
-    return {name: (ENGINE_SOURCES / name).read_bytes() for name in names}
+    sources = {}
+    for name in ("loop.h", "fmu.h", "optimal.c"):
+        sources[name] = (ENGINE_SOURCES / name).read_bytes()
+    return sources
 
 
 class CompiledTable:
@@ -134,7 +136,8 @@ class CompiledTable:
         self._run.restype = ctypes.c_longlong
         n_states = len(table.axes)
         n_actions = table.rows.shape[1] - 1
-        sizes = np.array([len(axis) for axis in table.axes], dtype=np.uintp)
+        points_of_axes = [len(axis) for axis in table.axes]
+        sizes = np.array(points_of_axes, dtype=np.uintp)
         arrays: list[NDArray[Any]] = [sizes]
         numbers = [
             np.concatenate(table.axes),

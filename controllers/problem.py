@@ -519,7 +519,8 @@ class Problem:
         NumPy's power differs in the last bit between processors, and with it all that is keyed by
         the generated C; Python's is the C library's.
         """
-        powers = [self.discount**k for k in range(self.horizon + 1)]
+        n_powers = self.horizon + 1
+        powers = [self.discount**k for k in range(n_powers)]
         return np.array(powers)
 
     @cached_property
@@ -710,7 +711,8 @@ class PlantProblem:
         x, u, d, p = problem.model.symbols()
         next_x = step(x, u, d, p)
         # The model holds the filter's value within a sample, at whose end it changes.
-        next_x[self.memory.state] = self.memory.next_value(x, d)
+        next_value = self.memory.next_value(x, d)
+        next_x[self.memory.state] = next_value
         return ca.Function("sampled", [x, u, d, p], [next_x])
 
     @property
@@ -777,7 +779,8 @@ class PlantProblem:
                     "shapes the noise, name it in plant.mapping.ranges and set disturbance.ranges"
                 )
             parameters[name] = value
-        values = np.array(list(parameters.values()), dtype=np.float64)
+        in_order = list(parameters.values())
+        values = np.array(in_order, dtype=np.float64)
         white = cls(problem, law, values)
         # One at most: `_require_whole_state` refuses more.
         for name, constant in filtered.items():
@@ -800,7 +803,8 @@ def _filtered(scenario: Scenario) -> dict[str, float]:
     """Time constants in s of the disturbances that vary and have a memory, by name."""
     plant = scenario.plant
     table = scenario.disturbance
-    constants = dict(zip(plant.disturbances, table.time_constant or (), strict=False))
+    stated = table.time_constant or ()
+    constants = dict(zip(plant.disturbances, stated, strict=False))
     # What no scenario sets is as the FMU has it.
     if not plant.mapping.time_constant:
         constants |= time_constants(_fmu_file(scenario))

@@ -628,7 +628,9 @@ class QpsolversBackend:
             except qpsolvers.QPError as error:
                 reason = str(error)
                 continue
-            if answer.x is None or not np.isfinite(answer.x).all():
+            if answer.x is None:
+                continue
+            if not np.isfinite(answer.x).all():
                 continue
             solution = polish(qp, _read_answer(qp, answer))
             # A solver may say that it failed where it is near: what it says is not looked at.

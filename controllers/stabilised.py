@@ -210,8 +210,9 @@ def _simulate_responses(
         controls[k] = K @ to_c
         controls[k, :, own] += np.eye(m)
         free_controls[k] = K @ free
+        r = stages.r[k]
         to_c = A @ to_c + B @ controls[k]
-        free = A @ free + B @ free_controls[k] + stages.r[k]
+        free = A @ free + B @ free_controls[k] + r
         states[k] = to_c
         free_states[k] = free
     return _Responses(
@@ -240,10 +241,16 @@ def _solve_daqp(
     flag, _ = model.setup(hessian, gradient, rows, upper, lower, kinds)
     if flag >= 0:
         # Of the hard rows the weights are not read.
-        unused = np.ones(len(rows) - w.size)
+        n_hard = len(rows) - w.size
+        unused = np.ones(n_hard)
         linear = np.concatenate([unused, w])
         compliance = np.concatenate([unused, 0.5 / W])
-        model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
+        model.soft_weights(
+            rho_l=compliance,
+            rho_u=compliance,
+            w_l=linear,
+            w_u=linear,
+        )
         c, _, flag, info = model.solve()
     if flag <= 0:
         status = DAQP_STATUS.get(flag, f"exit flag {flag}")

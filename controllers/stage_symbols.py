@@ -19,7 +19,12 @@ from cosim.core.protocols import Vector
 
 
 def given_size(problem: Problem, blocks: ThetaBlocks) -> int:
-    """Entries of (θ, σ)."""
+    """Entries of (θ, σ).
+
+    Args:
+        problem: The problem.
+        blocks: The blocks of θ.
+    """
     n_stages = problem.horizon + 1
     return blocks.size + len(problem.varying) * n_stages
 

@@ -141,7 +141,8 @@ class ThetaBlocks:
             if block.symmetric:
                 # In the order of the packed entries.
                 rows, columns = upper_triangle(block.shape[0])
-                entries = [f"{i},{j}" for i, j in zip(rows, columns, strict=True)]
+                pairs = zip(rows, columns, strict=True)
+                entries = [f"{i},{j}" for i, j in pairs]
             for entry in entries:
                 names.append(f"{block.name}[{entry}]")
         return tuple(names)

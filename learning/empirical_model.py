@@ -334,7 +334,13 @@ class Standardisation(NamedTuple):
         inputs: Array,
         c: Array,
     ) -> _Design:
-        """The model at inputs (M, n+m) about parameters c (p,)."""
+        """The model at inputs, linear about parameters.
+
+        Args:
+            features: the nominal model.
+            inputs: (s, a), (M, n+m).
+            c: errors of the parameters, (p,).
+        """
         y, G, h = features(inputs, c)
         standardised = (inputs - self.centre) / self.unit
         return _Design(y, G, h, design_rows(G, standardised))

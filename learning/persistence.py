@@ -151,7 +151,15 @@ def effective_number(persistence: Array, count: int) -> float:
 
 
 def linear_part(states: Matrix, errors: Matrix) -> Matrix:
-    """The part of errors (K, n) that is affine in the states (K, n), by least squares, (K, n)."""
+    """The part of errors that is affine in the states, by least squares.
+
+    Args:
+        states: s, (K, n).
+        errors: e, (K, n).
+
+    Returns:
+        The affine part, (K, n).
+    """
     spread = states.std(axis=0)
     unit = np.where(spread > 0, spread, 1.0)
     z = (states - states.mean(axis=0)) / unit

@@ -448,7 +448,8 @@ class BellmanOperator:
 
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
         """Results of a task for slices of `count` states, by the threads where there are any."""
-        entries = count * len(self._weights)
+        n_nodes = len(self._weights)
+        entries = count * n_nodes
         wanted = ceil(entries / ENTRIES_A_TASK)
         n_tasks = min(wanted, count)
         # Parts of nearly equal size, which do not depend on the number of threads.

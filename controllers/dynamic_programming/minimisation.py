@@ -136,7 +136,8 @@ def _first_simplices(
     """Vertices (B, m+1, m) of simplices with edges along the axes, within the box."""
     _, m = start.shape
     inside = np.clip(start, lower, upper)
-    vertices = np.repeat(inside[:, None], m + 1, axis=1)
+    n_vertices = m + 1
+    vertices = np.repeat(inside[:, None], n_vertices, axis=1)
     for i in range(m):
         # Vertex i+1 differs from the start in entry i, inwards where outwards leaves the box.
         entry = inside[:, i]

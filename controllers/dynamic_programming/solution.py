@@ -139,7 +139,15 @@ def refined(
         other_axes = [j for j in range(n) if j != i]
         marginal = mass_on_grid.sum(axis=tuple(other_axes))
         support = _support(axis, marginal, settings.tail)
-        finer_axis = _refined_axis(operator, settings, level, i, axis, support, deviation[i])
+        finer_axis = _refined_axis(
+            operator,
+            settings,
+            level,
+            i,
+            axis,
+            support,
+            deviation[i],
+        )
         axes.append(finer_axis)
         # Beyond a bound the value has a kink wherever the return takes one more sample.
         first = max(support[0], problem.state_lower[i])

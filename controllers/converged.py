@@ -135,6 +135,7 @@ class ConvergedNmpc(RtiNmpc):
             prepared = self._keep_preparation(None)
             return self._solution(prepared, enforced=enforced)
         finally:
+            # What stays prepared is the QP that a solver can take.
             self._linearise_as(lifts=True)
 
 

@@ -942,6 +942,7 @@ def solve_conic(
     )
     solution = solver.solve()
     status = str(solution.status)
+    # Nearly solved is of use, too: whoever asks checks what is made of it.
     if status not in {"Solved", "AlmostSolved"}:
         return None, status
     return np.array(solution.x), status

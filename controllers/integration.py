@@ -135,6 +135,7 @@ class _Predictor:
             present_x = state[:, :, 0]
             jacobian = state[:, :, 1:]
             value, slope = self.slopes(present_x, u)
+            # The variational equation: d/dt ∂x = (∂f/∂x) ∂x + (∂f/∂u) ∂u.
             by_state = slope[:, :, :n]
             by_action = slope[:, :, n:]
             from_state = by_state @ jacobian
@@ -214,6 +215,7 @@ def check_integration(problem: Problem) -> Integration:
         )
     if integration.coarse:
         where = "at the reference" if integration.at_reference else "at the bounds"
+        # Of a prediction that runs away a number says nothing.
         size = "many times"
         if integration.error < 10:
             size = f"{100 * integration.error:.0f} % of"

@@ -163,6 +163,7 @@ class ModelFunction:
 
 def _copy(argument: Any) -> Any:
     if isinstance(argument, ca.SX | ca.MX | ca.DM):
+        # A slice of all is a copy.
         return argument[:, :]
     return argument
 
@@ -208,6 +209,7 @@ def _meaning(error: Exception) -> str:
 def _short(error: Exception) -> str:
     """The exception in one line, without CasADi's lists of prototypes."""
     line = exception_line(error)
+    # The place in the user's file, which ends the line, stays.
     words, bracket, place = line.rpartition(" (")
     if len(words) > 160:
         words = f"{words[:157]}…"
@@ -286,6 +288,7 @@ class Model:
                 f"model '{self.name}': time_unit must be positive seconds, not {self.time_unit!r}"
             )
         object.__setattr__(self, "uncertain", tuple(self.uncertain))
+        # Raises where a name is no parameter's.
         self.parameter_indices(self.uncertain)
         # Called once with symbols: a mistake is reported where the model is made.
         ode = self._checked("ode", self.ode, len(self.states))
@@ -330,6 +333,7 @@ class Model:
 
     def _quantities(self, kind: str) -> tuple[Quantity, ...]:
         given = getattr(self, kind)
+        # A tuple of one is easily written without its comma.
         if isinstance(given, Quantity) or not isinstance(given, list | tuple):
             raise ModelError(
                 f"model '{self.name}': {kind} must be a tuple of controllers.Quantity, "

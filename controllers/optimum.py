@@ -269,6 +269,7 @@ class OptimalPolicy:
         if path is None:
             optimum = solve(plant, progress=progress)
             path = keep(key, optimum)
+        # Read back in any case: a policy that was solved now is the one that is stored.
         return cls(plant, read_optimum(path, key))
 
     @property

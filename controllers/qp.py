@@ -382,6 +382,7 @@ def polish(
             break
         solution = _newton_step(qp, solution)
         residual = solution.residual(qp)
+        # From a wrong active set a step may lead away, or in a circle.
         if residual < least:
             best = solution
             least = residual
@@ -545,6 +546,7 @@ class DaqpBackend:
         """Solve with the vectors of `qp`; raises QpError where DAQP does not."""
         variables = qp.f.size
         flag = self._factorised
+        # Until the end is reached: what follows may raise in several places.
         self._failed = True
         if flag >= 0:
             self._write_limits(qp)

@@ -240,7 +240,8 @@ def _solve_daqp(
     kinds = sense.astype(np.int32)
     flag, _ = model.setup(hessian, gradient, rows, upper, lower, kinds)
     if flag >= 0:
-        # Of the hard rows the weights are not read.
+        # A soft row has a linear price and the compliance 1/(2W); of the hard rows, which come
+        # first, the weights are not read.
         n_hard = len(rows) - w.size
         unused = np.ones(n_hard)
         linear = np.concatenate([unused, w])

@@ -413,6 +413,7 @@ class Parameters(Shown):
             names = blocks.block("p").labels
             chosen = problem.model.parameter_indices(names)
             values["p"] = problem.model.nominal_parameters[chosen]
+        # No rotation of the value, no linear cost, no model offset: all other blocks are zero.
         zero = cls(blocks, np.zeros(blocks.size))
         return zero.replace(values)
 
@@ -426,6 +427,7 @@ class Parameters(Shown):
             "hash": self.hash,
             "theta": values,
         }
+        # Whoever reads the file has the problem alone: these blocks say what they are of.
         if "p" in self.blocks:
             names = self.blocks.block("p").labels
             document["model_parameters"] = list(names)

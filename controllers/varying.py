@@ -62,6 +62,7 @@ def _of_model(
     model: Model,
 ) -> Varying:
     """The disturbance or parameter of a model that a signal is; raises ModelError."""
+    # No two quantities of a model have one name.
     disturbances = [quantity.name for quantity in model.disturbances]
     parameters = [quantity.name for quantity in model.parameters]
     if name in disturbances:

@@ -162,6 +162,7 @@ class GuessedPlant:
         problem = Problem.from_scenario(scenario)
         model = problem.model
         x, u, d, _ = model.symbols()
+        # Nobody knows better parameters than the nominal ones on the first day.
         p = ca.SX(ca.DM(model.nominal_parameters))
         simulate = discretise(model, problem.sampling_time, problem.substeps)
         next_x = simulate(x, u, d, p)

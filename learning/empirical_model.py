@@ -195,6 +195,7 @@ class Features:
         }
         function = c_source([self._function])
         loop = files("learning") / "features.c"
+        # The loop includes CasADi's function: no name of that leaves the library.
         sources: dict[str, str | bytes] = {
             "sizes.h": c_definitions(sizes),
             "nominal.h": f"#define CASADI_SYMBOL_EXPORT static\n{function}",

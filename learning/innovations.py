@@ -34,6 +34,7 @@ def replay(
     standardised = np.empty_like(readings)
     estimator.reset()
     for k, y in enumerate(readings):
+        # The reset filter stands before the first reading already.
         if k > 0:
             estimator.predict(actions[k - 1])
         estimator.correct(y)

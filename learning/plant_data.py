@@ -66,6 +66,7 @@ class PlantData:
 
     def add(self, transition: Transition) -> None:
         """Keep a transition in place of the oldest one."""
+        # Without the penalty, which is known: what is learned is smooth.
         stage_cost = np.array([transition.stage_cost])
         oldest = self.count % len(self._rows)
         self._rows[oldest] = np.concatenate(

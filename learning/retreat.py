@@ -83,6 +83,7 @@ def exceeds_prediction(
     if not np.isfinite(predicted):
         return False
     excess = cost.mean - predicted
+    # Equal batches leave no test: then the means decide.
     if cost.variance == 0:
         return excess > 0
     degrees_of_freedom = len(cost.batches) - 1

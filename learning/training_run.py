@@ -96,10 +96,12 @@ class TrainingRun(TrainingOptions):
     evaluation_steps: int = EVALUATION_STEPS
 
     def __post_init__(self) -> None:
+        # Completed first: the identity is that of the hyperparameters in force.
         completed = self.configuration.for_scenario(self.scenario)
         object.__setattr__(self, "configuration", completed)
         _check_options(self)
         _check_samples(self.samples)
+        # An evaluation stands in a row of the log, and a checkpoint ends with one.
         for name in ("evaluate_every", "checkpoint_every"):
             value = getattr(self, name)
             if value % self.log_every:

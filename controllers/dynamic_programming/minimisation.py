@@ -170,6 +170,7 @@ def scan(
         The best point (B, m) of each function, and its value (B,).
     """
     every_row = np.arange(len(start))
+    # The start counts too: a scan makes nothing worse.
     best = start.copy()
     values = objective(every_row, start)
     axes = []

@@ -334,6 +334,7 @@ def start_policy(
         share: How far the next improvement looks, as a share of a tenth of the action box.
     """
     problem = operator.problem
+    # Values of a mean cost are known up to a constant: one state's is set to zero.
     anchor = grid.nearest(problem.reference_state)
     W, gain, distribution = evaluate_policy(operator, grid, actions, anchor)
     tenth = 0.1 * (problem.action_upper - problem.action_lower)
@@ -541,6 +542,7 @@ def _accepted(optimum: Optimum) -> Optimum:
             f"policy iteration: the bounds of the gain, {optimum.lower:.6g} and "
             f"{optimum.upper:.6g}, are more than 1 % apart; allow more rounds or another grid"
         )
+    # Rounding may leave a probability below zero, and a bound on the gain's other side.
     accepted = replace(
         optimum,
         distribution=np.maximum(optimum.distribution, 0.0),

@@ -72,7 +72,6 @@ def core(
         ControllerError: Another `hessian`, a horizon too long for a thread's stack, or a model that
             calls what cannot be C.
     """
-    # In C a bad start would be a status of the first sample, on somebody else's machine.
     parameters.require_well_posed()
     functions = SampleFunctions(problem, parameters.blocks, hessian)
     reason = why_not_in_c(functions)
@@ -263,7 +262,6 @@ def _moving_bound_rows(problem: Problem) -> dict[str, Vector]:
     arrays = {}
     kinds: tuple[VaryingKind, ...] = ("lower", "upper")
     for kind in kinds:
-        # Doubles, as all arrays of `problem.h` are.
         rows = np.full(problem.n_states, -1.0)
         nominal = np.zeros(problem.n_states)
         for row, item in of_kind(problem.varying, kind):

@@ -146,9 +146,7 @@ class TrainingLoop:
         if self._loop.y is None or covariance is None:
             return self._penalty(s.tolist())
         variances = covariance.diagonal()
-        # One estimate: a row of each.
-        by_bound = normal_penalties(self._penalty, s[None], variances[None])
-        return float(by_bound.sum())
+        return float(normal_penalties(self._penalty, s[None], variances[None]).sum())
 
     @property
     def parameters(self) -> Parameters:

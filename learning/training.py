@@ -430,7 +430,6 @@ def run_training(
     clock = time.perf_counter()
     if hasattr(progress, "start"):
         progress.start(run)
-    algorithm = rule or load_algorithm(run.algorithm)
     best = build_controller(optimum, run.scenario) if optimum else None
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -446,33 +445,31 @@ def run_training(
         FmuPlant(run.scenario) as plant,
         FmuPlant(run.scenario) as evaluation_plant,
     ):
-        session = _Session(run, algorithm, plant, folder)
+        session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
         compile_functions(session.loop.controller, run.samples)
-        # Without a folder, too: it restarts the solver, and no digit may depend on a folder.
         if resume:
             session.load()
         else:
+            # Without a folder, too: it restarts the solver, and no digit may depend on a folder.
             session.checkpoint()
         evaluator = Evaluator(run, evaluation_plant, session.start, best)
         with reporting(progress, run.algorithm, run.samples, _Remark()) as report:
             # A function of the user's gets the rows of the log, a bar moves between them.
             status = session.run_to_the_end(evaluator, report, between=progress is True)
         learned = session.loop.parameters
-        trained = session.loop.algorithm
-        predicted_cost = getattr(trained, "predicted_cost", nan)
         training = Training(
             run=run,
             learned=learned,
             rows=session.rows,
             evaluation=evaluator.evaluate(learned.theta),
             status=status,
-            requires=trained.requires,
+            requires=session.loop.algorithm.requires,
             plant_samples=session.loop.counts.number,
             start=session.start,
             start_J=evaluator.start["J"],
             baselines=evaluator.baselines,
-            predicted_cost=float(predicted_cost),
-            changes=getattr(trained, "changes", None),
+            predicted_cost=float(getattr(session.loop.algorithm, "predicted_cost", nan)),
+            changes=getattr(session.loop.algorithm, "changes", None),
             functions=functions_of(session.loop.controller),
             without_checkpoint=session.without_checkpoint,
             wall_seconds=time.perf_counter() - clock,

@@ -118,10 +118,12 @@ class ModelFunction:
     def check(self, symbols: Sequence[ca.SX]) -> None:
         """Call it once with the symbols (x, u, d, p); raises ModelError on what cannot be used."""
         column = self(*symbols)
+        # CasADi would only say that types do not match, in some later call.
         if isinstance(column, ca.MX):
             raise self.error(
                 "it returned an MX expression: build it of x, u, d and p, which are SX, alone"
             )
+        # Free symbols are allowed here to be named below.
         function = ca.Function(
             "checked",
             list(symbols),

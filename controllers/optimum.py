@@ -559,6 +559,7 @@ class QuasiStaticPolicy:
         self.law = law
         self.policies = tuple(policies)
         self._h = sampling_time
+        # The first `prepare` makes it 0.
         self._sample = -1
 
     @classmethod

@@ -172,6 +172,7 @@ def _cost_sizes(problem: Problem, both: Vector) -> dict[str, float]:
     upper = problem.upper
     reference = problem.reference
     gradient, curvature, rates = _derivatives_at_reference(problem)
+    # A reference is written with a few digits: at a bound it may be beside it.
     near = ACTIVE_SHARE * (upper - lower)
     below = reference <= lower + near
     above = reference >= upper - near

@@ -72,6 +72,7 @@ class Dyna(QLearning):
         data.add(transition)
         since_fit = data.since_fit
         changed = False
+        # In between there is no window that was not looked at.
         shortest_window = settings.change_windows[0]
         if data.model is not None and since_fit % shortest_window == 0:
             predictions = data.predictions()

@@ -66,6 +66,7 @@ class Strategy:
         # Draw in every sample, so that runs of any probability stay paired.
         draw = rng.random()
         e = rng.standard_normal(self.lower.size)
+        # Where nothing falls the number of full samples is infinite.
         decay = min(1.0, self._full_samples / (number + 1))
         if draw >= self.probability * decay:
             return None

@@ -47,6 +47,7 @@ class OffsetFree(Algorithm):
         super().__init__(*arguments)
         self._start = self.controller.parameters
         self._model = OneStepModel(self.scenario)
+        # Of the start, for good: the offset is all that is learned of the model.
         self._parameters = self._model.parameters(self._start)
         self._errors = PredictionErrors(self.scenario, self.configuration.memory)
         self._offset: Vector = self._start["c_f"]

@@ -94,6 +94,7 @@ class Coordinates:
                 symmetric = start.blocks.block(name).unpack(delta)
                 factor = self._factors[name]
                 matrix = factor @ expm(symmetric) @ factor.T
+                # A block of θ must be symmetric to the last digit.
                 values[name] = (matrix + matrix.T) / 2
             elif name.startswith("b_"):
                 # The minimiser of the quadratic cost moves by δ.
@@ -138,6 +139,7 @@ class PolicySearch(Algorithm):
         horizon = self.scenario.controller.horizon
         self._settling = min(horizon, settings.episode - 1)
         origin = np.zeros(self._coordinates.size)
+        # It draws by a generator of its own, which the rule's seeds.
         self._search = CMA(
             mean=origin,
             sigma=settings.spread,

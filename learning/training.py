@@ -275,6 +275,7 @@ class Training(Result):
 
         run = self.run
         policy = nmpc(run.scenario, self.start, run.controller)
+        # Trainings have the seeds below HELD_OUT, evaluations those from there on.
         seed = 2 * HELD_OUT + run.seed
         # The start is in every frame already.
         rows = self.rows[1:]

@@ -374,6 +374,7 @@ class BellmanOperator:
                 matrix += sparse.csr_array((entries, places), shape=shape)
             return matrix, cost
 
+        # Rows of the grid's states in their order, whichever thread makes them.
         parts = self._map(rows_of, grid.size)
         matrices, costs = zip(*parts, strict=True)
         transition = sparse.vstack(matrices, format="csr")

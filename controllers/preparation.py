@@ -1241,6 +1241,7 @@ def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> Definition:
     }
     arguments = matrix_symbols(shapes)
     theta = stage_columns(problem, blocks, arguments["theta"])
+    # Mapped, so that its C is a loop over the stages.
     stages = stage.map(horizon)
     D = stages(
         arguments["x"],
@@ -1286,6 +1287,7 @@ def signal_costs(problem: Problem, blocks: ThetaBlocks) -> Definition:
         point = ca.vertcat(points["x"][:, k], points["u"][:, k])
         given = ca.vertcat(theta, symbols["sigma"][:, k], discounts[k])
         value, gradient = expand(point[:n], point[n:], given)
+        # The QP's variables are deviations from the reference: there the expansion has its constant.
         constant += value - ca.dot(gradient, point - problem.reference)
         moved, offset = _moved_cost(symbols["B_l"], symbols["b_l"], references[k])
         gradients.append(gradient + discounts[k] * moved)

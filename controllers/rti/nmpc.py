@@ -577,6 +577,7 @@ class Engine:
         same = _alike(compiled, read.stack)
 
         gradient, _ = functions.derivatives
+        # Its inputs are in the one memory or in the other.
         for name, values in gradient.inputs.items():
             source = read if name in read.places else prepared
             values[:] = source.part(name)
@@ -602,6 +603,7 @@ class Engine:
         """
         count = len(batch.states)
         statuses = np.empty(count, dtype=np.intc)
+        # Copies: a batch leaves the controller's own point and solution as they are.
         before = self._before.copy()
         after = self._after.copy()
         x, u, _ = batch.points
@@ -630,6 +632,7 @@ class Engine:
             after: Memory of the read-out, or a copy, with a solution of the QP.
         """
         m = self.action.size
+        # C writes both into one array, dπ/dθ first.
         split = m * self._n_theta
         jacobians: Vector = np.empty(split + m * self._n_states)
         failed = self._library.engine_policy(
@@ -905,6 +908,7 @@ class RtiNmpc:
             else:
                 column[:n_known] = values
                 column[n_known:] = values[-1]
+        # The last preparation is of other values.
         self._prepared = None
 
     # the two phases -----------------------------------------------------------------------------
@@ -992,6 +996,7 @@ class RtiNmpc:
 
     def _make_qp(self) -> None:
         """Linearise at the guess and condense; raises QpError where the QP is not finite."""
+        # A QP that fails here must not be taken for the one before.
         self._prepared = None
         if self._engine is not None:
             self._status = self._engine.prepare()
@@ -1133,6 +1138,7 @@ class RtiNmpc:
         """Solve in compiled code; 0 or a status."""
         if a is not None:
             engine.action[:] = a
+        # Where the preparation has failed there is no QP to solve.
         return self._status or engine.feedback(a is not None)
 
     def _condense(self) -> Prepared:
@@ -1221,6 +1227,7 @@ class RtiNmpc:
         self._qp.lower[:m] = lower
         self._qp.upper[:m] = upper
         finite = self._embed.finite()
+        # An enforced action is no input of the embedding, whose results were looked at.
         if a is not None:
             finite = finite and all(map(isfinite, a.tolist()))
         return finite

@@ -1287,7 +1287,7 @@ def signal_costs(problem: Problem, blocks: ThetaBlocks) -> Definition:
         point = ca.vertcat(points["x"][:, k], points["u"][:, k])
         given = ca.vertcat(theta, symbols["sigma"][:, k], discounts[k])
         value, gradient = expand(point[:n], point[n:], given)
-        # The QP's variables are deviations from the reference: there the expansion has its constant.
+        # The QP's variables are deviations from the reference: the constant is the value there.
         constant += value - ca.dot(gradient, point - problem.reference)
         moved, offset = _moved_cost(symbols["B_l"], symbols["b_l"], references[k])
         gradients.append(gradient + discounts[k] * moved)

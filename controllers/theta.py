@@ -103,6 +103,7 @@ class ThetaBlock:
         if self.symmetric:
             dimension = self.shape[0]
             return symmetric_matrix(packed, dimension)
+        # A copy: θ itself is shared, and read-only.
         return packed.reshape(self.shape).copy()
 
 

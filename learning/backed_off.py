@@ -212,6 +212,7 @@ class GuessedPlant:
         function.inputs["u"][:] = a
         function.inputs["d"][:] = d
         function()
+        # A copy: the next call writes into the same memory.
         self._s = function.part("y").copy()
         self._k += 1
         if self._sensors is not None:

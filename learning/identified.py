@@ -133,6 +133,7 @@ class Identified(Algorithm):
         offset = present["c_f"]
 
         def weighted_errors(scaled: Vector) -> Vector:
+            # The model's other parameters stay as they are.
             values[indices] = scaled * unit
             predicted = self._model.predict(states, actions, values)
             predicted = predicted + offset

@@ -318,6 +318,7 @@ class FittedPlant:
         rng = np.random.default_rng(self._seed)
         sensors = Sensors(self._tables)
         self._controller.parameters = _without_noise(theta)
+        # Forget the last rollout; the filter then stands where the data end.
         law.reset()
         estimator.load_state_dict(self._state)
         step.inputs["p"][:] = self._p

@@ -16,10 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ControllerError, ModelWarning, ParameterError, QpError, warn
 from controllers.export.core import (
     ENGINE_SOURCES,
-    STACK_LIMIT,
     STATUSES,
     controller_sources,
-    stack_needed,
     why_not_in_c,
 )
 from controllers.functions import (
@@ -467,6 +465,38 @@ def growth_over_horizon(problem: Problem) -> float:
     return float(radius**problem.horizon)
 
 
+LONG_HORIZON = 40
+"""Stages from which a QP of any width is solved stage by stage."""
+CONDENSING_LIMIT = 400_000
+"""Bytes of the stack that the engine's condensing may take: a thread may have no more than 512 kB.
+
+The QP itself and the solver's work are in the engine's arrays, not on the stack.
+"""
+
+
+def solves_by_stage(problem: Problem) -> bool:
+    """Whether a compiled engine solves the QP stage by stage and does not condense it.
+
+    Condensing costs a power of the horizon N, a sweep by stages a power of the width n + m: the
+    rule is of n, m and N (`python -m benchmarks.paths` measures both). Where the model is unstable
+    the condensed QP would lose its digits.
+
+    Args:
+        problem: The control problem, whose QP has N stages of n states and m actions.
+    """
+    n = problem.n_states
+    m = problem.n_actions
+    horizon = problem.horizon
+    # A rule of thumb: where this becomes faster depends on the plant and on θ.
+    long = horizon >= min(5 * (n + m), LONG_HORIZON)
+    # Responses of each stage's state to all controls, and the factor of the condensed Hessian.
+    controls = horizon * m
+    responses = (horizon + 1) * n * (controls + n + 1)
+    factor = controls * (controls + 1)
+    large = 8 * (responses + factor) > CONDENSING_LIMIT
+    return long or large or growth_over_horizon(problem) > GROWTH_LIMIT
+
+
 class Engine:
     """Prepares and solves in the memory of a controller's `functions`; `compile` makes one.
 
@@ -519,17 +549,11 @@ class Engine:
 
         Args:
             functions: The controller's functions, in whose memory the engine works.
-            stagewise: Whether the QP is solved stage by stage. None leaves it to a rule: one of
-                many stages is, one too large for an exported controller, and one of a model that
-                is so unstable that the condensed QP loses its digits.
+            stagewise: Whether the QP is solved stage by stage. None leaves it to the rule
+                `solves_by_stage`.
         """
         if stagewise is None:
-            problem = functions.problem
-            width = problem.n_states + problem.n_actions
-            # A rule of thumb: where this becomes faster depends on the plant and on θ.
-            long = problem.horizon >= 5 * width
-            large = stack_needed(functions) > STACK_LIMIT
-            stagewise = long or large or growth_over_horizon(problem) > GROWTH_LIMIT
+            stagewise = solves_by_stage(functions.problem)
         sources = controller_sources(functions, stagewise=stagewise)
         # Beside what is exported, the engine has derivatives and closed loops.
         for name in ("sensitivities.h", "loop.h", "fmu.h", "rti_loop.h", "engine.c"):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.paths import tanks_in_series
 from controllers import Parameters, Problem, QpError, RtiNmpc, ThetaBlocks, functions
 from controllers.factories import tuned
 from controllers.rti import nmpc
@@ -49,7 +50,7 @@ def both(problem, parameters):
 @pytest.fixture(autouse=True, params=["condensed", "stage by stage"])
 def compiled(request, monkeypatch):
     if request.param == "stage by stage":
-        monkeypatch.setattr(nmpc, "STACK_LIMIT", 0)
+        monkeypatch.setattr(nmpc, "solves_by_stage", lambda problem: True)
     monkeypatch.delenv("COSIM_COMPILE", raising=False)
     # Without contraction every level gives the same digits, and this one in a tenth of the time.
     monkeypatch.setattr(functions, "FLAGS", ("-O0", *functions.FLAGS[1:]))
@@ -58,6 +59,15 @@ def compiled(request, monkeypatch):
 
 condensed_alone = pytest.mark.parametrize("compiled", ["condensed"], indirect=True)
 """Of the plant in the loop, which does not know how the QP is solved."""
+
+
+@pytest.mark.parametrize(
+    ("n", "horizon", "by_stage"),
+    [(2, 10, False), (2, 20, True), (8, 10, False), (16, 10, False), (8, 40, True), (16, 40, True)],
+)
+def test_the_path_is_chosen_by_cost_and_not_by_the_export(n, horizon, by_stage, compiled):
+    if compiled == "condensed":
+        assert nmpc.solves_by_stage(tanks_in_series(n, horizon)) is by_stage
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,96 @@
+"""`python -m benchmarks.paths N_STATES HORIZON …`: condensed beside stage by stage.
+
+Tanks in series, both paths of the compiled engine on the same states in one process, in turns. It
+prints the processor time of each phase and the ratio that `controllers.rti.nmpc` has its rule from.
+A state count and a horizon for each case, such as `8 10 16 10`.
+"""
+
+import sys
+
+import casadi as ca
+import numpy as np
+
+from benchmarks.scaling import PHASES, walk
+from controllers import Model, Parameters, Problem, Quantity, RtiNmpc
+from controllers.rti.nmpc import Engine
+
+REPETITIONS = 5
+SAMPLES = 20
+
+
+def tanks_in_series(n, horizon):
+    """Tanks that empty into each other, two pumps; the cost pulls the last level to its bound."""
+    fed = n // 2
+    flows = np.where(np.arange(n) < fed, 0.5, 1.0)
+
+    def ode(x, u, d, p):
+        out = flows * ca.sqrt(ca.fmax(x, 1e-3))
+        inflow = ca.vertcat(u[0], out[:-1])
+        inflow[fed] += u[1]
+        return inflow - out
+
+    def cost(x, u, d, p):
+        return ca.sum1(u) + 0.1 * ca.sumsqr(u) + 0.1 * ca.sumsqr(x - 1)
+
+    model = Model(
+        name="tanks_in_series",
+        states=tuple(Quantity(f"h{i}", "1") for i in range(n)),
+        actions=(Quantity("u0", "1"), Quantity("u1", "1")),
+        disturbances=(),
+        parameters=(),
+        ode=ode,
+        economic_cost=cost,
+    )
+    state_lower = np.full(n, 0.9)
+    state_lower[-1] = 1.0
+    return Problem(
+        model=model,
+        sampling_time=0.5,
+        horizon=horizon,
+        discount=0.99,
+        state_lower=state_lower,
+        state_upper=np.full(n, 1.1),
+        action_lower=np.zeros(2),
+        action_upper=np.ones(2),
+        penalty_linear=np.full(n, 100.0),
+        penalty_quadratic=np.full(n, 100.0),
+        reference_state=np.ones(n),
+        reference_action=np.full(2, 0.5),
+        reference_cost=1.0,
+    )
+
+
+def controllers_by_path(problem):
+    """A compiled controller of each path, and which of them the rule chooses."""
+    controllers = {}
+    for stagewise in (False, True):
+        controller = RtiNmpc(problem, Parameters.naive(problem))
+        engine = Engine.compile(controller._functions, stagewise=stagewise)
+        assert engine is not None, "there is no C compiler, or it took too long"
+        controller._engine = engine
+        controllers[stagewise] = controller
+    return controllers
+
+
+def measure(n, horizon):
+    """Print the phases of both paths in µs, and their ratio."""
+    controllers = controllers_by_path(tanks_in_series(n, horizon))
+    best = {path: dict.fromkeys(PHASES, np.inf) for path in controllers}
+    for _ in range(REPETITIONS):
+        for path, controller in controllers.items():
+            for phase, seconds in walk(controller, SAMPLES).items():
+                best[path][phase] = min(best[path][phase], seconds)
+    sums = {}
+    for path, phases in best.items():
+        sums[path] = sum(phases.values())
+        name = "stage by stage" if path else "condensed"
+        parts = ", ".join(f"{phase} {1e6 * phases[phase]:.0f}" for phase in PHASES)
+        print(f"n = {n}, N = {horizon}, {name}: {1e6 * sums[path]:.0f} µs ({parts})")
+    ratio = sums[False] / sums[True]
+    print(f"n = {n}, N = {horizon}: condensed takes {ratio:.2f} × stage by stage", flush=True)
+
+
+if __name__ == "__main__":
+    numbers = [int(word) for word in sys.argv[1:]]
+    for states, stages in zip(numbers[::2], numbers[1::2], strict=True):
+        measure(states, stages)

@@ -1,31 +1,36 @@
-"""A sample in CasADi: linearise and condense to a QP, put the state in, read the solution out."""
+"""A sample's QP in CasADi: linearise and condense, then put the state in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
-from controllers.functions import Definition, StackedFunction, define
+from controllers.functions import (
+    Definition,
+    StackedFunction,
+    define,
+    matrix_symbols,
+    scalar_symbols,
+    stage_function,
+)
 from controllers.integration import check_integration
 from controllers.model import runge_kutta
 from controllers.problem import Problem
-from controllers.qp import LEAST_SIZE, SoftQp
+from controllers.qp import SoftQp
+from controllers.readout import readout, soft_bounds
 from controllers.reuse import built_once
 from controllers.stage_symbols import (
     given_size,
     moved_references,
     stage_columns,
-    state_bounds,
     symbolic_given,
     symbolic_stage,
-    true_bounds,
 )
 from controllers.theta import Parameters, Symbols, ThetaBlocks
 from controllers.varying import of_kind
@@ -34,20 +39,6 @@ from cosim.core.validation import instead
 
 SOLVED_RESIDUAL = 1e-8
 """Largest KKT residual of a QP that counts as solved."""
-
-
-Shapes = Mapping[str, tuple[int, int]]
-"""Rows and columns of matrices by name."""
-
-
-def scalar_symbols(shapes: Shapes) -> dict[str, ca.SX]:
-    """Symbols of these shapes for an expression in scalars (SX)."""
-    return {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
-
-
-def matrix_symbols(shapes: Shapes) -> dict[str, ca.MX]:
-    """Symbols of these shapes for a graph of calls of other functions (MX)."""
-    return {name: ca.MX.sym(name, *shape) for name, shape in shapes.items()}
 
 
 def sampled_jacobian(
@@ -209,28 +200,6 @@ def stage_parameter_gradient(
     by_theta = ca.gradient(lagrangian, theta)
     by_parameters = by_theta[blocks.slices["p"]]
     return stage_function("parameter_gradient", arguments, {"gradient": by_parameters})
-
-
-def stage_function(
-    name: str,
-    arguments: Mapping[str, ca.SX],
-    results: Mapping[str, ca.SX],
-) -> ca.Function:
-    """Function of one stage, to be mapped over the horizon: dense, common expressions shared.
-
-    Args:
-        name: Name of the function, in C too.
-        arguments: Its symbols by the names of its inputs.
-        results: Its expressions by the names of its outputs.
-    """
-    return ca.Function(
-        name,
-        [ca.densify(argument) for argument in arguments.values()],
-        [ca.densify(result) for result in results.values()],
-        list(arguments),
-        list(results),
-        {"cse": True},
-    )
 
 
 def _linearisation_symbols(
@@ -550,33 +519,58 @@ def embedding_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     n = problem.n_states
     m = problem.n_actions
     horizon = problem.horizon
-    symbols = symbolic_given(problem, blocks)
-    s = ca.SX.sym("s", n)
+    shapes = {
+        "s": (n, 1),
+        "theta": (given_size(problem, blocks), 1),
+        "Phi": (n, horizon * n),
+        "g": (horizon * n, 1),
+        "f": (horizon * m, 1),
+        "F": (n, horizon * m),
+    }
+    arguments = matrix_symbols(shapes)
     x_s = ca.DM(problem.reference_state)
-    state_scale = ca.DM(problem.scale.state)
-    condensed = scalar_symbols(
+    xi = (arguments["s"] - x_s) / ca.DM(problem.scale.state)
+    bounds = soft_bounds(problem, blocks, arguments["theta"])
+    stages = _embed(n, m).map(horizon)
+    f, lower, upper = stages(
+        ca.repmat(xi, 1, horizon),
+        arguments["Phi"],
+        ca.reshape(arguments["g"], n, horizon),
+        ca.reshape(arguments["f"], m, horizon),
+        arguments["F"],
+        ca.horzcat(*[bound["soft_lower"] for bound in bounds]),
+        ca.horzcat(*[bound["soft_upper"] for bound in bounds]),
+    )
+    results = {
+        "f": ca.vec(f),
+        "lower": ca.vec(lower),
+        "upper": ca.vec(upper),
+    }
+    return define("embedding", arguments, results)
+
+
+def _embed(n: int, m: int) -> ca.Function:
+    """The gradient in v_k (m,) and the limits (n,) of the rows of ξ_{k+1}, from ξ_0."""
+    symbols = scalar_symbols(
         {
-            "Phi": (n, horizon * n),
-            "g": (horizon * n, 1),
-            "f": (horizon * m, 1),
-            "F": (n, horizon * m),
+            "xi": (n, 1),
+            "Phi": (n, n),
+            "g": (n, 1),
+            "f": (m, 1),
+            "F": (n, m),
+            "soft_lower": (n, 1),
+            "soft_upper": (n, 1),
         }
     )
-
-    xi = (s - x_s) / state_scale
-    gradient = condensed["f"] + condensed["F"].T @ xi
-    # What the states do with no control; the rows have room for the controls' part.
-    free = condensed["Phi"].T @ xi + condensed["g"]
-    x_l, x_u = state_bounds(problem, symbols)
-    lower = [(bound - x_s) / state_scale for bound in x_l[1:]]
-    upper = [(bound - x_s) / state_scale for bound in x_u[1:]]
+    xi = symbols["xi"]
+    # What the state does with no control; the rows have room for the controls' part.
+    free = symbols["Phi"].T @ xi + symbols["g"]
     results = {
-        "f": gradient,
-        "lower": ca.vertcat(*lower) - free,
-        "upper": ca.vertcat(*upper) - free,
+        "gradient": symbols["f"] + symbols["F"].T @ xi,
+        "lower": symbols["soft_lower"] - free,
+        "upper": symbols["soft_upper"] - free,
     }
-    arguments = {"s": s, "theta": symbols["theta"], **condensed}
-    return define("embedding", arguments, results)
+    return stage_function("embed", symbols, results)
 
 
 def embedding(
@@ -612,368 +606,6 @@ def embedding(
         shared,
         memory=read.memory[first:last],
     )
-
-
-class _SoftBounds(NamedTuple):
-    """Bounds of a stage's states in units of `Problem.scale`, and their undiscounted weights.
-
-    All are (n,).
-    """
-
-    lower: ca.SX
-    upper: ca.SX
-    w: ca.SX
-    W: ca.SX
-
-
-class _Stage(NamedTuple):
-    """A stage's part of the read-out's inputs, in units of `Problem.scale`.
-
-    Aᵀ (n, n), Bᵀ (m, n) and r (n,) of the dynamics; L (n+m, n+m) and q (n+m,) of the cost; v (m,),
-    its multiplier ν and limits; λ (n,) of the next stage's state.
-    """
-
-    A: ca.SX
-    B: ca.SX
-    r: ca.SX
-    L: ca.SX
-    q: ca.SX
-    v: ca.SX
-    nu: ca.SX
-    lam: ca.SX
-    lower: ca.SX
-    upper: ca.SX
-
-    def next_state(self, xi: ca.SX) -> ca.SX:
-        """ξ₊ = A ξ + B v + r."""
-        return self.A.T @ xi + self.B.T @ self.v + self.r
-
-    def cost(self, xi: ca.SX) -> ca.SX:
-        """½wᵀLw + qᵀw of w = (ξ, v)."""
-        w = ca.vertcat(xi, self.v)
-        return _quadratic(self.L, self.q, w)
-
-    def cost_gradients(self, xi: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """L w + q of w = (ξ, v): the cost's gradients in ξ (n,) and v (m,)."""
-        w = ca.vertcat(xi, self.v)
-        gradient = self.L @ w + self.q
-        n = xi.numel()
-        return gradient[:n], gradient[n:]
-
-    def curvatures(self) -> tuple[ca.SX, ca.SX]:
-        """Absolute diagonal entries of L: those of ξ (n,) and of v (m,)."""
-        diagonal = ca.fabs(ca.diag(self.L))
-        n = self.lam.numel()
-        return diagonal[:n], diagonal[n:]
-
-
-def _stages(inputs: Mapping[str, ca.SX]) -> list[_Stage]:
-    """The stages 0 … N−1 of the read-out's inputs, which have them side by side."""
-    n = inputs["A"].size1()
-    m = inputs["B"].size1()
-    columns_a_stage = {"A": n, "B": n, "L": n + m}
-    parts = []
-    for name in _Stage._fields:
-        columns = columns_a_stage.get(name, 1)
-        by_stage = ca.horzsplit(inputs[name], columns)
-        parts.append(by_stage)
-    return [_Stage(*stage) for stage in zip(*parts, strict=True)]
-
-
-@built_once
-def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
-    """States, slack, costates, value and residual that belong to a solution of the condensed QP.
-
-    The QP and its solution are in units of `Problem.scale`, the results in the model's. The
-    costates χ solve the adjoint recursion, so χ_0 is the gradient of the value in s. The solution
-    shifted by one stage is the next point of linearisation.
-
-    Args:
-        problem: The problem with its model and scale.
-        blocks: The blocks of θ.
-
-    Returns:
-        Function of s (n); the primal-dual solution v (m, N), lam (n, N), nu (m, N) with the limits
-        `lower` and `upper` (m, N) of v; the QP's A, B, r, L, q, L_N, q_N, the constant of its stage
-        costs, and theta. Its results are xi (n, N+1), t (n, N), chi (n, N+1), value; `residual`,
-        see `_residual`; next_x (n, N), next_u (m, N) in absolute units, next_chi (n, N), the
-        costates of stages that weigh 1/γ as much.
-    """
-    n = problem.n_states
-    m = problem.n_actions
-    horizon = problem.horizon
-    scale = problem.scale
-    state_scale = ca.DM(scale.state)
-    price = ca.DM(scale.state_price)
-    x_s = ca.DM(problem.reference_state)
-    symbols = symbolic_given(problem, blocks)
-    B_lambda = symbols["B_lambda"]
-    b_lambda = symbols["b_lambda"]
-    inputs = _readout_symbols(n, m, horizon)
-    L_N = inputs["L_N"]
-    q_N = inputs["q_N"]
-    stages = _stages(inputs)
-    bounds = _soft_bounds(problem, symbols)
-    _, x_u = state_bounds(problem, symbols)
-
-    # Forward: states, slack and value. The penalty of s itself is that of the true bounds.
-    s = inputs["s"]
-    deviation = s - x_s
-    penalty = problem.symbolic_penalty(s, true_bounds(problem, symbols))
-    linear = ca.dot(b_lambda, deviation)
-    value = inputs["constant"] + penalty + symbols["c_lambda"]
-    value += ca.bilin(B_lambda, deviation) + linear
-    value /= scale.cost
-    origin = x_s / state_scale
-    xi = [deviation / state_scale]
-    slack = []
-    for k, stage in enumerate(stages):
-        next_xi = stage.next_state(xi[k])
-        soft = bounds[k]
-        below = soft.lower - next_xi
-        above = next_xi - x_u[k + 1] / state_scale + origin
-        t = ca.fmax(below, above)
-        t = ca.fmax(t, 0)
-        penalty_of_slack = ca.dot(soft.w, t) + ca.dot(soft.W, t**2)
-        value += stage.cost(xi[k])
-        value += problem.discount ** (k + 1) * penalty_of_slack
-        xi.append(next_xi)
-        slack.append(t)
-    value += _quadratic(L_N, q_N, xi[horizon])
-
-    # Backward: costates, from the gradient of the terminal cost to those of the initial one.
-    end_gradient = L_N @ xi[horizon] + q_N
-    initial_gradient = 2 * B_lambda @ deviation + b_lambda
-    penalty_gradient = ca.gradient(penalty, s)
-    chi = _costates(
-        stages,
-        xi,
-        end_gradient,
-        [initial_gradient / price, penalty_gradient / price],
-    )
-
-    # In the model's units.
-    action_scale = ca.repmat(ca.DM(scale.action), 1, horizon)
-    actions = inputs["v"] * action_scale
-    states = [column * state_scale for column in xi]
-    costates = [column * price for column in chi]
-    violations = [column * state_scale for column in slack]
-    results = {
-        "xi": ca.horzcat(*states),
-        "t": ca.horzcat(*violations),
-        "chi": ca.horzcat(*costates),
-        "value": value * scale.cost,
-        **_shifted(problem, states, actions, costates),
-        "residual": _residual(problem, stages, L_N, xi, chi, bounds),
-    }
-    arguments = {**inputs, "theta": symbols["theta"]}
-    return define("readout", arguments, results)
-
-
-def readout(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    prepared: StackedFunction,
-) -> StackedFunction:
-    """`readout_definition` with a memory for a sample's solution.
-
-    Args:
-        problem: The problem with its model and scale.
-        blocks: The blocks of θ.
-        prepared: `preparation`'s function: theta and the QP's matrices are read from its memory.
-
-    Returns:
-        The function. Behind its results its memory has room for the rest of a solution: what
-        `embedding` gives, and what compiled code gives, `iterations` of the QP's solver and the
-        gradient (n_θ,).
-    """
-    n_variables = problem.horizon * problem.n_actions
-    n_rows = problem.horizon * problem.n_states
-    from_preparation = ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
-    shared = {name: prepared.part(name) for name in from_preparation}
-    room = {
-        "f": n_variables,
-        "row_lower": n_rows,
-        "row_upper": n_rows,
-        "iterations": 1,
-        "gradient": blocks.size,
-    }
-    definition = readout_definition(problem, blocks)
-    return StackedFunction(definition, shared, room=room)
-
-
-def _soft_bounds(problem: Problem, symbols: Symbols) -> list[_SoftBounds]:
-    """Bounds and weights of the states 1 … N, by symbols of `symbolic_given`."""
-    x_s = ca.DM(problem.reference_state)
-    state_scale = ca.DM(problem.scale.state)
-    price = ca.DM(problem.scale.state_price)
-    w = symbols["w_sigma"] / price
-    W = symbols["W_sigma"] * (state_scale / price)
-    x_l, x_u = state_bounds(problem, symbols)
-    bounds = []
-    for lower, upper in zip(x_l[1:], x_u[1:], strict=True):
-        scaled_lower = (lower - x_s) / state_scale
-        scaled_upper = (upper - x_s) / state_scale
-        bounds.append(_SoftBounds(scaled_lower, scaled_upper, w, W))
-    return bounds
-
-
-def _quadratic(hessian: ca.SX, gradient: ca.SX, w: ca.SX) -> ca.SX:
-    """½wᵀHw + gᵀw."""
-    return ca.bilin(hessian, w) / 2 + ca.dot(gradient, w)
-
-
-def _costates(
-    stages: Sequence[_Stage],
-    xi: Sequence[ca.SX],
-    end_gradient: ca.SX,
-    initial_gradients: Sequence[ca.SX],
-) -> list[ca.SX]:
-    """Costates χ_0 … χ_N by the adjoint recursion, (n,) each, in units of `Problem.scale`.
-
-    The state of stage k ≥ 1 has a soft row, whose λ is that of stage k−1; that of stage 0 has the
-    initial cost in its place.
-    """
-    next_costate = end_gradient + stages[-1].lam
-    chi = [next_costate]
-    for k in reversed(range(len(stages))):
-        stage = stages[k]
-        by_state, _ = stage.cost_gradients(xi[k])
-        costate = by_state + stage.A @ next_costate
-        own_gradients = [stages[k - 1].lam] if k else initial_gradients
-        for gradient in own_gradients:
-            costate += gradient
-        chi.insert(0, costate)
-        next_costate = costate
-    return chi
-
-
-def _shifted(
-    problem: Problem,
-    states: Sequence[ca.SX],
-    actions: ca.SX,
-    costates: Sequence[ca.SX],
-) -> dict[str, ca.SX]:
-    """The next point of linearisation: the first stage dropped, the last control repeated.
-
-    `states` ξ_0 … ξ_N and `actions` v (m, N) are deviations from the reference, in the model's
-    units as `costates` χ_0 … χ_N.
-    """
-    x_s = ca.DM(problem.reference_state)
-    u_s = ca.DM(problem.reference_action)
-    next_states = [column + x_s for column in states[1:]]
-    later_actions = actions[:, 1:]
-    last_action = actions[:, -1]
-    next_actions = ca.horzcat(later_actions, last_action)
-    # A stage that comes to weigh γᵏ⁻¹ in place of γᵏ has costates 1/γ as large.
-    next_costates = [column / problem.discount for column in costates[2:]]
-    next_costates.append(costates[-1])
-    return {
-        "next_x": ca.horzcat(*next_states),
-        "next_u": next_actions + ca.repmat(u_s, 1, problem.horizon),
-        "next_chi": ca.horzcat(*next_costates),
-    }
-
-
-def _readout_symbols(n: int, m: int, horizon: int) -> dict[str, ca.SX]:
-    """Symbols of the read-out's inputs but θ, in the order in which C gives them."""
-    shapes: Shapes = {
-        "s": (n, 1),
-        "v": (m, horizon),
-        "lam": (n, horizon),
-        "nu": (m, horizon),
-        "lower": (m, horizon),
-        "upper": (m, horizon),
-        "A": (n, n * horizon),
-        "B": (m, n * horizon),
-        "r": (n, horizon),
-        "L": (n + m, horizon * (n + m)),
-        "q": (n + m, horizon),
-        "L_N": (n, n),
-        "q_N": (n, 1),
-        "constant": (1, 1),
-    }
-    return scalar_symbols(shapes)
-
-
-def _residual(
-    problem: Problem,
-    stages: Sequence[_Stage],
-    L_N: ca.SX,
-    xi: Sequence[ca.SX],
-    chi: Sequence[ca.SX],
-    bounds: Sequence[_SoftBounds],
-) -> ca.SX:
-    """How far a solution is from optimal, without a unit and without what condensing rounds off.
-
-    The states ξ and the costates χ come from v, λ and the stages' own data, so the dynamics hold.
-    What is left of the optimality conditions is, with σ_j the largest of |L w + q|_j, |Bᵀχ|_j,
-    |ν_j| and the curvature of one step, the largest of
-
-        |L w + q + Bᵀχ + ν|_j / σ_j,  |v − clip(v + ν/σ)|_j,  |y − prox(y + λ/w)|_i / (1 + |y_i|)
-
-    with y = ξ_{k+1}. The last is that of the soft bound Σ t + (W/w) t²; feasibility, sign and
-    complementarity at once. All are zero exactly at the solution.
-    """
-    next_discounts = problem.discounts[1:].tolist()
-    terminal_curvature = ca.fabs(ca.diag(L_N))
-    next_curvatures = [stage.curvatures()[0] for stage in stages[1:]]
-    next_curvatures.append(terminal_curvature)
-    errors = []
-    for k, stage in enumerate(stages):
-        v = stage.v
-        nu = stage.nu
-        _, cost = stage.cost_gradients(xi[k])
-        pull = stage.B @ chi[k + 1]
-        # The curvature in v_k: of its own stage, and of the next one through the state.
-        _, own_curvature = stage.curvatures()
-        curvature = own_curvature + stage.B**2 @ next_curvatures[k]
-        size = ca.fmax(ca.fabs(cost), ca.fabs(pull))
-        size = ca.fmax(size, ca.fabs(nu))
-        size = ca.fmax(size, curvature)
-        size = ca.fmax(size, LEAST_SIZE)
-        stationarity = ca.fabs(cost + pull + nu)
-        errors.append(stationarity / size)
-
-        pushed = v + nu / size
-        projection = _symbolic_projection(pushed, stage.lower, stage.upper)
-        errors.append(ca.fabs(v - projection))
-
-        weight = next_discounts[k] * bounds[k].w
-        soft_bound_error = _soft_bound_error(xi[k + 1], stage.lam / weight, bounds[k])
-        errors.append(soft_bound_error)
-    return _largest_entry(errors)
-
-
-def _largest_entry(errors: Sequence[ca.SX]) -> ca.SX:
-    """The largest of all entries of these vectors."""
-    entries = ca.vertsplit(ca.vertcat(*errors))
-    largest = entries[0]
-    for error in entries[1:]:
-        largest = ca.fmax(largest, error)
-    return largest
-
-
-def _symbolic_projection(values: ca.SX, lower: ca.SX, upper: ca.SX) -> ca.SX:
-    """Projection of values on the box between the limits."""
-    from_below = ca.fmax(values, lower)
-    return ca.fmin(from_below, upper)
-
-
-def _soft_bound_error(y: ca.SX, relative_lam: ca.SX, bounds: _SoftBounds) -> ca.SX:
-    """|y − prox(y + λ/w)| / (1 + |y|) of the soft bound, as in `QpSolution.residual`."""
-    shifted = y + relative_lam
-    nearest = _symbolic_projection(shifted, bounds.lower, bounds.upper)
-    beyond = shifted - nearest
-    # The slack's weight holds y on the bound until λ is larger than it: a distance of 1 here.
-    excess = ca.fabs(beyond) - 1
-    charged = ca.fmax(excess, 0)
-    curvature = 2 * bounds.W / bounds.w
-    violation = charged / (1 + curvature)
-    proximal = nearest + ca.sign(beyond) * violation
-    error = ca.fabs(y - proximal)
-    size = 1 + ca.fabs(y)
-    return error / size
 
 
 @dataclass(frozen=True)
@@ -1273,7 +905,7 @@ def signal_costs(problem: Problem, blocks: ThetaBlocks) -> Definition:
     scale = problem.scale
     symbols = symbolic_given(problem, blocks)
     points = scalar_symbols({"x": (n, horizon), "u": (m, horizon)})
-    references = moved_references(problem, symbols)
+    references = moved_references(problem, symbols["sigma"])
     x, u, at_stage = _linearisation_symbols(problem, blocks)
     cost = _varying_cost(problem, at_stage, x, u)
     slope = ca.gradient(cost, ca.vertcat(x, u))

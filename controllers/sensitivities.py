@@ -13,13 +13,15 @@ from functools import cache, cached_property
 import casadi as ca
 import numpy as np
 
-from controllers.functions import Definition, StackedFunction, define
-from controllers.preparation import (
+from controllers.functions import (
+    Definition,
+    StackedFunction,
+    define,
     matrix_symbols,
     scalar_symbols,
     stage_function,
-    stage_parameter_gradient,
 )
+from controllers.preparation import stage_parameter_gradient
 from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.reuse import built_once
@@ -62,7 +64,7 @@ def _theta_lagrangian(
     multipliers = ca.horzsplit(y["lam"])
     point = ca.horzsplit(points)
 
-    references = moved_references(problem, symbols)
+    references = moved_references(problem, symbols["sigma"])
     has_moved = bool(of_kind(problem.varying, "reference"))
 
     # λ_θ(ξ_0), then the stages, then V^f_θ(ξ_N).

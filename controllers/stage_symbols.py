@@ -8,13 +8,16 @@ signals too, and a problem without any has the same functions as ever. A functio
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 import numpy as np
 
 from controllers.errors import ModelError
+from controllers.functions import Expression
 from controllers.problem import Problem
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
-from controllers.varying import of_kind
+from controllers.varying import VaryingKind, of_kind
 from cosim.core.protocols import Vector
 
 
@@ -51,6 +54,24 @@ def symbolic_given(problem: Problem, blocks: ThetaBlocks) -> Symbols:
     # A stage in each column, as CasADi stacks them.
     symbols["sigma"] = ca.reshape(behind, count, n_stages)
     return symbols
+
+
+def given_parts(problem: Problem, blocks: ThetaBlocks, given: ca.MX) -> dict[str, ca.MX]:
+    """Parts of (θ, σ) for a graph of calls: θ's blocks, packed as θ has them, and `sigma`.
+
+    A slack weight that is no block is the problem's constant, `sigma` is (n_σ, N+1).
+
+    Args:
+        problem: The problem.
+        blocks: The blocks of θ.
+        given: (θ, σ).
+    """
+    parts = {name: given[place] for name, place in blocks.slices.items()}
+    parts.setdefault("w_sigma", ca.MX(ca.DM(problem.penalty_linear)))
+    parts.setdefault("W_sigma", ca.MX(ca.DM(problem.penalty_quadratic)))
+    behind = given[blocks.size :]
+    parts["sigma"] = ca.reshape(behind, len(problem.varying), problem.horizon + 1)
+    return parts
 
 
 def symbolic_stage(problem: Problem, blocks: ThetaBlocks) -> Symbols:
@@ -122,7 +143,10 @@ def stage_columns(
     return ca.vertcat(theta_of_stages, sigma_of_stages, row_of_discounts)
 
 
-def state_bounds(problem: Problem, symbols: Symbols) -> tuple[list[ca.SX], list[ca.SX]]:
+def state_bounds(
+    problem: Problem,
+    symbols: Mapping[str, Expression],
+) -> tuple[list[Expression], list[Expression]]:
     """θ's lower and upper bounds of the states at the stages 0 … N, (n,) each.
 
     A bound that moves is θ's, moved by as much as the signal is off the scenario's bound: what θ
@@ -130,10 +154,11 @@ def state_bounds(problem: Problem, symbols: Symbols) -> tuple[list[ca.SX], list[
 
     Args:
         problem: The problem.
-        symbols: Of `symbolic_given`.
+        symbols: Of `symbolic_given` or `given_parts`.
     """
-    lower = _moved(problem, symbols, "lower", symbols["x_l"])
-    upper = _moved(problem, symbols, "upper", symbols["x_u"])
+    sigma = symbols["sigma"]
+    lower = _moved(problem, sigma, "lower", symbols["x_l"])
+    upper = _moved(problem, sigma, "upper", symbols["x_u"])
     return lower, upper
 
 
@@ -146,28 +171,39 @@ def true_bounds(problem: Problem, symbols: Symbols) -> tuple[ca.SX, ca.SX] | Non
     """
     if not of_kind(problem.varying, "lower", "upper"):
         return None
-    lower = _moved(problem, symbols, "lower", ca.SX(ca.DM(problem.state_lower)))
-    upper = _moved(problem, symbols, "upper", ca.SX(ca.DM(problem.state_upper)))
+    sigma = symbols["sigma"]
+    lower = _moved(problem, sigma, "lower", ca.SX(ca.DM(problem.state_lower)))
+    upper = _moved(problem, sigma, "upper", ca.SX(ca.DM(problem.state_upper)))
     return lower[0], upper[0]
 
 
-def moved_references(problem: Problem, symbols: Symbols) -> list[ca.SX]:
-    """How far the cost's reference is from the problem's at the stages 0 … N, (n+m,) each."""
-    still = ca.SX.zeros(problem.n_states + problem.n_actions)
-    return _moved(problem, symbols, "reference", still)
+def moved_references(problem: Problem, sigma: Expression) -> list[Expression]:
+    """How far the cost's reference is from the problem's at the stages 0 … N, (n+m,) each.
+
+    Args:
+        problem: The problem.
+        sigma: Values of the varying quantities, (n_σ, N+1).
+    """
+    still = type(sigma).zeros(problem.n_states + problem.n_actions)
+    return _moved(problem, sigma, "reference", still)
 
 
-def _moved(problem: Problem, symbols: Symbols, kind: str, start: ca.SX) -> list[ca.SX]:
+def _moved(
+    problem: Problem,
+    sigma: Expression,
+    kind: VaryingKind,
+    start: Expression,
+) -> list[Expression]:
     """A vector at the stages 0 … N, moved by the varying quantities of a kind."""
-    moving = of_kind(problem.varying, kind)  # type: ignore[arg-type]
+    moving = of_kind(problem.varying, kind)
     n_stages = problem.horizon + 1
     if not moving:
-        # One expression for all of them: its C is that of a problem where nothing varies.
+        # One expression for all of them: what is made of it is computed once.
         return [start] * n_stages
     stages = []
     for k in range(n_stages):
-        vector = ca.SX(start)
+        vector = type(start)(start)
         for row, item in moving:
-            vector[item.place] += symbols["sigma"][row, k] - item.nominal
+            vector[item.place] += sigma[row, k] - item.nominal
         stages.append(vector)
     return stages

@@ -6,7 +6,8 @@ import pytest
 
 from controllers import ThetaBlocks
 from controllers.model import discretise
-from controllers.preparation import embedding, preparation, readout, sampled_jacobian
+from controllers.preparation import embedding, preparation, sampled_jacobian
+from controllers.readout import readout
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 
 N, n, m = 10, 2, 2

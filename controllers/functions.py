@@ -103,7 +103,7 @@ def stage_function(
     arguments: Mapping[str, ca.SX],
     results: Mapping[str, ca.SX],
 ) -> ca.Function:
-    """Function of one stage, to be called for each: dense, common expressions shared.
+    """Function of one stage, to be mapped over the horizon: dense, common expressions shared.
 
     A graph of such calls keeps the generated C short: written out for all stages, that of eight
     states and ten stages took gcc 24 s, and that of 32 states an hour or more.
@@ -121,6 +121,35 @@ def stage_function(
         list(results),
         {"cse": True},
     )
+
+
+def sweep_function(
+    name: str,
+    arguments: Mapping[str, ca.SX],
+    results: Mapping[str, ca.SX],
+) -> ca.Function:
+    """`stage_function` of a sweep over the stages, without the arguments that it does not need.
+
+    The results of one stage are arguments of the next, so that stages are called one by one, with
+    `call`: an argument that is passed for nothing costs more than the arithmetic of two states.
+
+    Args:
+        name: Name of the function, in C too.
+        arguments: Symbols by name, among which are those of the results.
+        results: Its expressions by the names of its outputs.
+    """
+    stacked = ca.veccat(*results.values())
+    free = {symbol.element_hash() for symbol in ca.symvar(stacked)}
+    needed = {}
+    for argument, symbols in arguments.items():
+        if any(symbol.element_hash() in free for symbol in ca.symvar(symbols)):
+            needed[argument] = symbols
+    return stage_function(name, needed, results)
+
+
+def call(function: ca.Function, **values: ca.MX | float) -> dict[str, ca.MX]:
+    """Results of a function by name, given those of the values that it has inputs for."""
+    return function.call({name: values[name] for name in function.name_in()})
 
 
 class StackedFunction:

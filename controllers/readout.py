@@ -14,10 +14,12 @@ from controllers.functions import (
     Definition,
     Shapes,
     StackedFunction,
+    call,
     define,
     matrix_symbols,
     scalar_symbols,
     stage_function,
+    sweep_function,
 )
 from controllers.problem import Problem
 from controllers.qp import LEAST_SIZE
@@ -81,7 +83,8 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
 
     # Forward: states, slack and value.
     begin = _begin(problem, blocks)
-    first = begin(
+    first = call(
+        begin,
         s=arguments["s"],
         constant=arguments["constant"],
         theta=arguments["theta"],
@@ -91,7 +94,8 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     slack: list[ca.MX] = []
     forward = _forward(problem)
     for k in range(horizon):
-        moved = forward(
+        moved = call(
+            forward,
             **stages[k],
             **bounds[k],
             next_discount=next_discounts[k],
@@ -105,7 +109,8 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     # Backward: costates and residual, from the gradient of the terminal cost to those of the
     # initial one.
     end = _end(n)
-    last = end(
+    last = call(
+        end,
         xi=xi[horizon],
         value=value,
         L_N=arguments["L_N"],
@@ -117,7 +122,8 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
     chi: list[ca.MX] = []
     backward = _backward(problem)
     for k in reversed(range(horizon)):
-        came = backward(
+        came = call(
+            backward,
             **stages[k],
             **bounds[k],
             next_discount=next_discounts[k],
@@ -199,7 +205,8 @@ def soft_bounds(problem: Problem, blocks: ThetaBlocks, theta: ca.MX) -> list[dic
     scaled = _scaled_bounds(problem)
     bounds = []
     for lower, upper in zip(x_l[1:], x_u[1:], strict=True):
-        of_state = scaled(
+        of_state = call(
+            scaled,
             x_l=lower,
             x_u=upper,
             w_sigma=parts["w_sigma"],
@@ -331,7 +338,7 @@ def _forward(problem: Problem) -> ca.Function:
         "next_value": next_value,
     }
     arguments = {**stage, **bounds, "xi": xi, "value": value}
-    return stage_function("readout_forward", arguments, results)
+    return sweep_function("readout_forward", arguments, results)
 
 
 def _end(n: int) -> ca.Function:
@@ -414,7 +421,7 @@ def _backward(problem: Problem) -> ca.Function:
         "curvature": curvatures[:n],
         "largest": _largest([carried["residual"], *errors]),
     }
-    return stage_function("readout_backward", {**stage, **bounds, **carried}, results)
+    return sweep_function("readout_backward", {**stage, **bounds, **carried}, results)
 
 
 def _quadratic(hessian: ca.SX, gradient: ca.SX, w: ca.SX) -> ca.SX:

@@ -7,7 +7,7 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, cached_property
 
 import casadi as ca
@@ -15,96 +15,75 @@ import numpy as np
 
 from controllers.functions import (
     Definition,
+    Shapes,
     StackedFunction,
+    call,
     define,
     matrix_symbols,
     scalar_symbols,
     stage_function,
+    sweep_function,
 )
 from controllers.preparation import stage_parameter_gradient
 from controllers.problem import Problem, Scale
 from controllers.qp import QpSolution, SoftQp, kkt_solve
 from controllers.reuse import built_once
-from controllers.stage_symbols import moved_references, stage_columns, symbolic_given
-from controllers.theta import Symbols, ThetaBlocks
+from controllers.stage_symbols import (
+    given_parts,
+    given_size,
+    moved_references,
+    stage_columns,
+)
+from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
 from controllers.varying import of_kind
-from cosim.core.protocols import Matrix
+from cosim.core.protocols import Matrix, Vector
 
 SOLUTION_PARTS = ("xi", "t", "chi", "v", "lam")
 """First inputs of the sensitivities: a solution's parts."""
 
 
-def _theta_lagrangian(
+def _stage_lagrangian(
     problem: Problem,
-    symbols: Symbols,
-    y: Mapping[str, ca.SX],
-    points: ca.SX,
-    M: ca.SX | None,
+    theta: Symbols,
+    stage: Mapping[str, ca.SX],
 ) -> ca.SX:
-    """Terms of the QP's Lagrangian that hold θ, all but those of the model's parameters p.
+    """A stage's terms of the QP's Lagrangian that hold θ, all but those of the model's p.
 
     Args:
         problem: The problem.
-        symbols: Symbols of θ and the signals (`symbolic_given`).
-        y: Solution in the model's units: `xi` and `chi` (n, N+1), `v` (m, N), the slack `t` and
-            the rows' multipliers `lam` (n, N).
-        points: Points of linearisation (x, u) in the model's units, (n+m, N).
-        M: Derivatives of the second-order term by the blocks L_k of the exact Hessian, side by
-            side, (n+m, N(n+m)); None where the Hessian is the cost's own.
+        theta: Symbols of θ (`symbolic_theta`).
+        stage: What `_Sensitivities.stage` names, in the model's units.
     """
     # What does not hold θ has no part in the derivative, and is left out.
-    horizon = problem.horizon
-    gamma = problem.discount
-    B_l = symbols["B_l"]
-    b_l = symbols["b_l"]
-    xi = ca.horzsplit(y["xi"])
-    chi = ca.horzsplit(y["chi"])
-    v = ca.horzsplit(y["v"])
-    slack = ca.horzsplit(y["t"])
-    multipliers = ca.horzsplit(y["lam"])
-    point = ca.horzsplit(points)
+    B_l = theta["B_l"]
+    w = ca.vertcat(stage["xi"], stage["v"])
+    if "reference" in stage:
+        w -= stage["reference"]
+    cost = ca.dot(theta["b_l"], w)
+    if "M" not in stage:
+        cost += ca.bilin(B_l, w)
+    else:
+        # The cost expanded about the point, where B_l enters the lifted block by M too.
+        about = ca.vertcat(stage["x"], stage["u"]) - problem.reference
+        if "reference" in stage:
+            about -= stage["reference"]
+        cost += ca.bilin(B_l, about, 2 * w - about)
+        cost += 2 * ca.dot(stage["M"], B_l)
+    dynamics = ca.dot(stage["chi"], theta["c_f"])
+    terms = stage["discount"] * cost + dynamics
 
-    references = moved_references(problem, symbols["sigma"])
-    has_moved = bool(of_kind(problem.varying, "reference"))
+    # The slack's price, which counts from stage 1 on.
+    t = stage["t"]
+    terms += stage["next_discount"] * ca.dot(theta["w_sigma"], t)
+    terms += stage["next_discount"] * ca.dot(theta["W_sigma"], t**2)
 
-    # λ_θ(ξ_0), then the stages, then V^f_θ(ξ_N).
-    terms = _quadratic_form(symbols["B_lambda"], symbols["b_lambda"], xi[0])
-    terms += symbols["c_lambda"]
-    for k in range(horizon):
-        w = ca.vertcat(xi[k], v[k])
-        if has_moved:
-            w -= references[k]
-        stage = ca.dot(b_l, w)
-        if M is None:
-            stage += ca.bilin(B_l, w)
-        else:
-            # The cost expanded about the point, where B_l enters the lifted block by M too.
-            about = point[k] - problem.reference
-            if has_moved:
-                about -= references[k]
-            M_k = ca.horzsplit(M, w.numel())[k]
-            stage += ca.bilin(B_l, about, 2 * w - about)
-            stage += 2 * ca.dot(M_k, B_l)
-        dynamics = ca.dot(chi[k + 1], symbols["c_f"])
-        terms += gamma**k * stage + dynamics
-
-        # The slack's price, which counts from stage 1 on.
-        t = slack[k]
-        next_discount = gamma ** (k + 1)
-        terms += next_discount * ca.dot(symbols["w_sigma"], t)
-        terms += next_discount * ca.dot(symbols["W_sigma"], t**2)
-
-        # λ is negative where a lower limit pushes, positive where an upper one does.
-        lam = multipliers[k]
-        from_below = ca.fmax(-lam, 0)
-        from_above = ca.fmax(lam, 0)
-        terms += ca.dot(from_below, symbols["x_l"])
-        terms -= ca.dot(from_above, symbols["x_u"])
-    end = xi[horizon]
-    if has_moved:
-        end = end - references[horizon][: problem.n_states]
-    terminal = _quadratic_form(symbols["B_Vf"], symbols["b_Vf"], end)
-    return terms + gamma**horizon * terminal
+    # λ is negative where a lower limit pushes, positive where an upper one does.
+    lam = stage["lam"]
+    from_below = ca.fmax(-lam, 0)
+    from_above = ca.fmax(lam, 0)
+    terms += ca.dot(from_below, theta["x_l"])
+    terms -= ca.dot(from_above, theta["x_u"])
+    return terms
 
 
 def _quadratic_form(B: ca.SX, b: ca.SX, x: ca.SX) -> ca.SX:
@@ -113,10 +92,13 @@ def _quadratic_form(B: ca.SX, b: ca.SX, x: ca.SX) -> ca.SX:
 
 
 class _Sensitivities:
-    """Symbols and the Lagrangian's gradient in θ, of which both functions are made.
+    """Makes the gradient of the Lagrangian in θ and its derivatives, both by a sweep backward.
 
-    The QP's v, lam and matrices are inputs in units of `Problem.scale`, all else is in the model's;
-    `y` are the symbols of a solution in the model's units, in which the Lagrangian is written.
+    A stage's part is a function of its own, called for each. It adds to the sum of the stages
+    behind it, so that the sum is that of one derivative of the whole Lagrangian, to the last bit.
+
+    The QP's v, lam, matrices and directions are in units of `Problem.scale`, all else is in the
+    model's.
     """
 
     def __init__(
@@ -132,162 +114,358 @@ class _Sensitivities:
         self.problem = problem
         self.blocks = blocks
         self.exact = exact
-        solution_shapes = {
+        self.moves = bool(of_kind(problem.varying, "reference"))
+        self.theta = symbolic_theta(problem, blocks)
+        shapes = {
             "xi": (n, horizon + 1),
-            "v": (m, horizon),
             "t": (n, horizon),
-            "lam": (n, horizon),
             "chi": (n, horizon + 1),
+            "v": (m, horizon),
+            "lam": (n, horizon),
+            "x": (n, horizon),
+            "u": (m, horizon),
+            "theta": (given_size(problem, blocks), 1),
         }
-        self.y = scalar_symbols(solution_shapes)
-        self.scaled = scalar_symbols({"v": (m, horizon), "lam": (n, horizon)})
-        points = scalar_symbols({"x": (n, horizon), "u": (m, horizon)})
-        curvature: dict[str, ca.SX] = {}
         if exact:
-            curvature_shapes = {
-                "M": (n + m, horizon * (n + m)),
-                "guess": (n, horizon),
-            }
-            curvature = scalar_symbols(curvature_shapes)
-        self.M = curvature.get("M")
+            shapes["M"] = (n + m, horizon * (n + m))
+            shapes["guess"] = (n, horizon)
+        self.shapes: Shapes = shapes
+        """Of the inputs of both functions."""
 
-        symbols = symbolic_given(problem, blocks)
-        theta = symbols["theta"]
-        lagrangian = _theta_lagrangian(
-            problem,
-            symbols,
-            self.y,
-            ca.vertcat(*points.values()),
-            self.M,
-        )
-        self.gradient = ca.gradient(lagrangian, theta)[: blocks.size]
-        """All of it but the part of p, which is a sum of a function of one stage."""
+    def stage(self) -> dict[str, ca.SX]:
+        """Symbols of a stage's part: w's ξ and v, the point x and u, what belongs to ξ_{k+1}.
 
-        self.inputs = {
-            "xi": self.y["xi"],
-            "t": self.y["t"],
-            "chi": self.y["chi"],
-            "v": self.scaled["v"],
-            "lam": self.scaled["lam"],
-            **points,
-            "theta": theta,
-            **curvature,
+        That are its slack t, λ and χ. `reference` is Δ_k, how far a reference has moved, and M the
+        derivative of the second-order term by the block L_k of the exact Hessian, (n+m, n+m).
+        """
+        n = self.problem.n_states
+        m = self.problem.n_actions
+        shapes = {
+            "xi": (n, 1),
+            "t": (n, 1),
+            "chi": (n, 1),
+            "v": (m, 1),
+            "lam": (n, 1),
+            "x": (n, 1),
+            "u": (m, 1),
+            "discount": (1, 1),
+            "next_discount": (1, 1),
         }
+        if self.exact:
+            shapes["M"] = (n + m, n + m)
+        if self.moves:
+            shapes["reference"] = (n + m, 1)
+        return scalar_symbols(shapes)
 
-    def in_scaled_units(self, expression: ca.SX) -> ca.SX:
-        """The expression of v and lam in the model's units as one of the scaled ones."""
+    def _stages(self, inputs: Mapping[str, ca.MX]) -> list[dict[str, ca.MX]]:
+        """The parts of `stage` of a solution, by stage."""
+        problem = self.problem
+        discounts = problem.discounts.tolist()
+        references = self._references(inputs)
+        columns = {name: ca.horzsplit(inputs[name]) for name in (*SOLUTION_PARTS, "x", "u")}
+        stages = []
+        for k in range(problem.horizon):
+            stage = {name: by_stage[k] for name, by_stage in columns.items()}
+            stage["chi"] = columns["chi"][k + 1]
+            stage["discount"] = discounts[k]
+            stage["next_discount"] = discounts[k + 1]
+            if self.exact:
+                width = problem.n_states + problem.n_actions
+                stage["M"] = ca.horzsplit(inputs["M"], width)[k]
+            if self.moves:
+                stage["reference"] = references[k]
+            stages.append(stage)
+        return stages
+
+    def _in_model_units(self, stage: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
+        """A stage's part whose v and lam are in the QP's units, in the model's."""
         scale = self.problem.scale
-        horizon = self.problem.horizon
-        action_scale = ca.repmat(ca.DM(scale.action), 1, horizon)
-        price = ca.repmat(ca.DM(scale.state_price), 1, horizon)
-        v = self.scaled["v"] * action_scale
-        lam = self.scaled["lam"] * price
-        # The QP's own numbers come as they are, so the conversion is part of the function.
-        unscaled = [self.y["v"], self.y["lam"]]
-        (substituted,) = ca.substitute([expression], unscaled, [v, lam])
-        return substituted
+        v = stage["v"] * ca.DM(scale.action)
+        lam = stage["lam"] * ca.DM(scale.state_price)
+        return {**stage, "v": v, "lam": lam}
+
+    def _gradient(self, stage: Mapping[str, ca.SX], total: ca.SX) -> ca.SX:
+        """The sum of gradients `total` with a stage's, whose part is in the model's units."""
+        theta = self.theta["theta"]
+        lagrangian = _stage_lagrangian(self.problem, self.theta, stage) + ca.dot(total, theta)
+        return ca.gradient(lagrangian, theta)
+
+    def _ends(self) -> dict[str, ca.SX]:
+        """Symbols of ξ_0 and of ξ_N less what the terminal cost's reference has moved."""
+        n = self.problem.n_states
+        return scalar_symbols({"first_xi": (n, 1), "last_xi": (n, 1)})
+
+    def _ends_gradient(self, ends: Mapping[str, ca.SX]) -> ca.SX:
+        """∇θ of the initial cost λ_θ(ξ_0) and of the terminal one, γᴺ V^f_θ(ξ_N)."""
+        theta = self.theta
+        end_discount = self.problem.discount**self.problem.horizon
+        terms = _quadratic_form(theta["B_lambda"], theta["b_lambda"], ends["first_xi"])
+        terms += theta["c_lambda"]
+        terms += end_discount * _quadratic_form(theta["B_Vf"], theta["b_Vf"], ends["last_xi"])
+        return ca.gradient(terms, theta["theta"])
+
+    def _ends_of(self, inputs: Mapping[str, ca.MX]) -> dict[str, ca.MX]:
+        """The parts of `_ends` of a solution."""
+        xi = ca.horzsplit(inputs["xi"])
+        last_xi = xi[-1]
+        if self.moves:
+            last_xi -= self._references(inputs)[-1][: self.problem.n_states]
+        return {"first_xi": xi[0], "last_xi": last_xi}
+
+    def _references(self, inputs: Mapping[str, ca.MX]) -> list[ca.MX]:
+        """How far the cost's reference is from the problem's at the stages 0 … N."""
+        parts = given_parts(self.problem, self.blocks, inputs["theta"])
+        return moved_references(self.problem, parts["sigma"])
 
     @cached_property
     def value_gradient(self) -> Definition:
         """dV/dθ or dQ/dθ: the Lagrangian's gradient at a solution."""
-        results = {"gradient": self.in_scaled_units(self.gradient)}
-        if "p" not in self.blocks:
-            return define("value_gradient", self.inputs, results)
+        stage = self.stage()
+        total = ca.SX.sym("total", self.blocks.size)
+        gradient = self._gradient(self._in_model_units(stage), total)
+        add_stage = sweep_function(
+            "add_stage_gradient",
+            {**stage, "total": total},
+            {"sum": gradient},
+        )
+        ends = self._ends()
+        ends_gradient = sweep_function(
+            "ends_gradient",
+            ends,
+            {"gradient": self._ends_gradient(ends)},
+        )
 
-        # A stage's gradient is called: written out for each stage its C takes minutes to compile.
-        rest = stage_function("value_gradient_rest", self.inputs, results)
-        stages = self._stage_gradient.map(self.problem.horizon)
-        symbols = _call_symbols(self.inputs)
-        arguments = self._stage_arguments(symbols)
-        by_stage = stages(*arguments)
-        gradient = rest(*symbols.values())
-        gradient[self._parameters] = ca.sum2(by_stage)
-        return define("value_gradient", symbols, {"gradient": gradient})
+        inputs = matrix_symbols(self.shapes)
+        sum_of_stages = call(ends_gradient, **self._ends_of(inputs))["gradient"]
+        for part in reversed(self._stages(inputs)):
+            sum_of_stages = call(add_stage, **part, total=sum_of_stages)["sum"]
+        if "p" in self.blocks:
+            by_stage = self._stage_gradient.map(self.problem.horizon)
+            gradients = by_stage(*self._stage_arguments(inputs))
+            sum_of_stages[self._parameters] = ca.sum2(gradients)
+        return define("value_gradient", inputs, {"gradient": sum_of_stages})
 
     @cached_property
     def policy_jacobian(self) -> Definition:
-        """dπ/dθ and dπ/ds, transposed: derivatives of the gradient along the KKT adjoints."""
+        """dπ/dθ and dπ/ds, transposed: derivatives of the gradient along the KKT adjoints.
+
+        An adjoint direction moves v, t, lam and, with the exact Hessian, M; how it moves the states
+        follows from the dynamics, forward, and the costates from the adjoint recursion, backward.
+        """
         problem = self.problem
         n = problem.n_states
         m = problem.n_actions
         horizon = problem.horizon
-        width = n + m
-        qp_shapes = {
+        block = (n + m) ** 2
+        shapes = {
+            **self.shapes,
             "A": (n, n * horizon),
             "B": (m, n * horizon),
-            "L": (width, horizon * width),
+            "L": (n + m, horizon * (n + m)),
             "L_N": (n, n),
-        }
-        direction_shapes = {
             "dv": (m * horizon, m),
             "dt": (n * horizon, m),
             "dlam": (n * horizon, m),
         }
-        moving = list(self.y.values())
-        if self.M is not None:
-            direction_shapes["dM"] = (width * horizon * width, m)
-            moving.append(self.M)
-        qp = scalar_symbols(qp_shapes)
-        directions = scalar_symbols(direction_shapes)
+        if self.exact:
+            shapes["dM"] = (block * horizon, m)
+        inputs = matrix_symbols(shapes)
+        A = ca.horzsplit(inputs["A"], n)
+        B = ca.horzsplit(inputs["B"], n)
+        L = ca.horzsplit(inputs["L"], n + m)
+        rows = {"dv": m, "dt": n, "dlam": n}
+        if self.exact:
+            rows["dM"] = block
+        directions = []
+        for k in range(horizon):
+            of_stage = {}
+            for name, count in rows.items():
+                of_stage[name] = inputs[name][k * count : (k + 1) * count, :]
+            directions.append(of_stage)
 
-        policy = []
-        by_state = []
-        moved: dict[str, ca.SX] = {}
-        for i in range(m):
-            column = {name: direction[:, i] for name, direction in directions.items()}
-            # In the model's units: the right-hand side was one unit of the scaled action's price.
-            unit = float(problem.scale.action[i] / problem.scale.cost)
-            direction = self._direction(qp, column, unit)
-            derivative = _derivative_along(self.gradient, moving, direction.values())
-            # dy/dθ is minus the inverse KKT matrix times ∇θ∇_y: hence the sign.
-            policy.append(-self.in_scaled_units(derivative))
-            d_xi = direction["xi"]
-            d_chi = direction["chi"]
-            by_state.append(-d_chi[:, 0])
-            # What of the direction the stages' gradients in p need.
-            moved[f"w_{i}"] = ca.vertcat(d_xi[:, :-1], direction["v"])
-            moved[f"chi_{i}"] = d_chi[:, 1:]
-        inputs = {**self.inputs, **qp, **directions}
+        # Forward from a state that is given, so does not move.
+        move = self._moved_state()
+        dxi = [ca.MX.zeros(n, m)]
+        for k in range(horizon):
+            next_dxi = move(A[k], B[k], dxi[k], directions[k]["dv"])
+            dxi.append(next_dxi)
+
+        end = self._moved_end()
+        of_end = call(end, **self._ends_of(inputs), L_N=inputs["L_N"], dxi=dxi[horizon])
+        total = of_end["gradient"]
+        by_next_state = of_end["by_state"]
+        stages = self._stages(inputs)
+        moved: list[dict[str, ca.MX]] = []
+        add_stage = self._moved_stage()
+        for k in reversed(range(horizon)):
+            of_stage = call(
+                add_stage,
+                **stages[k],
+                **directions[k],
+                A=A[k],
+                L=L[k],
+                dxi=dxi[k],
+                by_next_state=by_next_state,
+                total=total,
+            )
+            total = of_stage["sum"]
+            by_next_state = of_stage["by_state"]
+            moved.insert(0, of_stage)
+        # dy/dθ is minus the inverse KKT matrix times ∇θ∇_y: hence the sign.
+        policy = -total
+        if "p" in self.blocks:
+            policy[self._parameters, :] = -self._moved_parameters(inputs, moved, directions)
+        price = ca.repmat(ca.DM(problem.scale.state_price), 1, m)
+        units = ca.repmat(ca.DM(self._units).T, n, 1)
         results = {
-            "policy": ca.horzcat(*policy),
-            "state": ca.horzcat(*by_state),
+            "policy": policy,
+            "state": -(by_next_state * price * units),
         }
-        if "p" not in self.blocks:
-            return define("policy_jacobian", inputs, results)
-        return self._with_parameters(inputs, results, moved)
+        return define("policy_jacobian", inputs, results)
 
-    def _with_parameters(
+    @property
+    def _units(self) -> Vector:
+        """One unit of each scaled action's price in the model's units: the right-hand sides'."""
+        scale = self.problem.scale
+        return scale.action / scale.cost
+
+    def _moved_state(self) -> ca.Function:
+        """dξ_{k+1} (n, m) from A_kᵀ, B_kᵀ, dξ_k and dv_k, a column a direction."""
+        n = self.problem.n_states
+        m = self.problem.n_actions
+        symbols = scalar_symbols(
+            {
+                "A": (n, n),
+                "B": (m, n),
+                "dxi": (n, m),
+                "dv": (m, m),
+            }
+        )
+        next_dxi = symbols["A"].T @ symbols["dxi"] + symbols["B"].T @ symbols["dv"]
+        return stage_function("moved_state", symbols, {"next_dxi": next_dxi})
+
+    def _moved_end(self) -> ca.Function:
+        """The ends' part of the derivatives in θ, and dχ_N without its soft row's λ."""
+        problem = self.problem
+        n = problem.n_states
+        m = problem.n_actions
+        state_scale = ca.DM(problem.scale.state)
+        ends = self._ends()
+        directions = scalar_symbols({"L_N": (n, n), "dxi": (n, m)})
+        gradient = self._ends_gradient(ends)
+        derivatives = []
+        for i in range(m):
+            along = directions["dxi"][:, i] * state_scale * self._units[i]
+            derivatives.append(_derivative_along(gradient, [ends["last_xi"]], [along]))
+        results = {
+            "gradient": ca.horzcat(*derivatives),
+            "by_state": directions["L_N"] @ directions["dxi"],
+        }
+        return sweep_function("moved_end", {**ends, **directions}, results)
+
+    def _moved_stage(self) -> ca.Function:
+        """Adds a stage's part to the derivatives in θ, and goes from dχ_{k+1} to dχ_k.
+
+        Its arguments are those of a stage, and a column for each direction: dξ, dv, dt, dλ and, if
+        exact, dM; all of dχ_{k+1} but its soft row's λ; the sum of the stages behind it. With the
+        model's parameters in θ it gives dw and dχ_{k+1} in the model's units, side by side, too.
+        """
+        problem = self.problem
+        scale = problem.scale
+        n = problem.n_states
+        m = problem.n_actions
+        stage = self.stage()
+        shapes = {
+            "A": (n, n),
+            "L": (n + m, n + m),
+            "dxi": (n, m),
+            "dv": (m, m),
+            "dt": (n, m),
+            "dlam": (n, m),
+            "by_next_state": (n, m),
+            "total": (self.blocks.size, m),
+        }
+        if self.exact:
+            shapes["dM"] = ((n + m) ** 2, m)
+        directions = scalar_symbols(shapes)
+        dchi = directions["by_next_state"] + directions["dlam"]
+
+        # Symbols of the solution in the model's units: those along which the directions are.
+        unscaled = {**stage, **scalar_symbols({"v": (m, 1), "lam": (n, 1)})}
+        total = ca.SX.sym("sum", self.blocks.size)
+        gradient = self._gradient(unscaled, total)
+        moving = ["xi", "v", "t", "lam", "chi"]
+        if self.exact:
+            moving.append("M")
+        variables = [unscaled[name] for name in moving]
+        sums = []
+        steps = []
+        costates = []
+        for i in range(m):
+            # From the QP's units to the model's, and from its unit right-hand side.
+            unit = float(self._units[i])
+            action = ca.DM(scale.action) * unit
+            along = {
+                "xi": directions["dxi"][:, i] * ca.DM(scale.state) * unit,
+                "v": directions["dv"][:, i] * action,
+                "t": directions["dt"][:, i] * ca.DM(scale.state * unit),
+                "lam": directions["dlam"][:, i] * ca.DM(scale.state_price * unit),
+                "chi": dchi[:, i] * ca.DM(scale.state_price) * unit,
+            }
+            if self.exact:
+                along["M"] = directions["dM"][:, i]
+            derivative = _derivative_along(
+                gradient,
+                [*variables, total],
+                [*along.values(), directions["total"][:, i]],
+            )
+            sums.append(derivative)
+            steps.append(ca.vertcat(along["xi"], along["v"]))
+            costates.append(along["chi"])
+
+        # The QP's own numbers come as they are, so the conversion is part of the function.
+        in_units = self._in_model_units(stage)
+        (sum_of_stages,) = ca.substitute(
+            [ca.horzcat(*sums)],
+            [unscaled["v"], unscaled["lam"]],
+            [in_units["v"], in_units["lam"]],
+        )
+        by_w = directions["L"] @ ca.vertcat(directions["dxi"], directions["dv"])
+        results = {
+            "sum": sum_of_stages,
+            "by_state": by_w[:n, :] + directions["A"] @ dchi,
+        }
+        if "p" in self.blocks:
+            results["dw"] = ca.horzcat(*steps)
+            results["dchi"] = ca.horzcat(*costates)
+        return sweep_function("moved_stage", {**stage, **directions}, results)
+
+    def _moved_parameters(
         self,
-        inputs: Mapping[str, ca.SX],
-        results: Mapping[str, ca.SX],
-        moved: Mapping[str, ca.SX],
-    ) -> Definition:
-        """`policy_jacobian` with the rows of the model's parameters p, from the stages' gradients.
+        inputs: Mapping[str, ca.MX],
+        moved: Sequence[Mapping[str, ca.MX]],
+        directions: Sequence[Mapping[str, ca.MX]],
+    ) -> ca.MX:
+        """The derivatives' rows of the model's parameters p, (n_p, m), from the stages' gradients.
 
         Args:
             inputs: The function's inputs.
-            results: Its results, without p.
-            moved: Directional derivatives of w and chi by name, for each action.
+            moved: `dw` and `dchi` of each stage.
+            directions: `dM` of each stage, if exact.
         """
-        horizon = self.problem.horizon
-        rest = stage_function("policy_jacobian_rest", inputs, {**results, **moved})
-        stages = self._moved_parameter_gradient().map(horizon)
-        symbols = _call_symbols(inputs)
-        arguments = self._stage_arguments(symbols)
-        values = rest(*symbols.values())
-        parts = dict(zip(rest.name_out(), values, strict=True))
-        jacobian = parts["policy"]
-        for i in range(self.problem.n_actions):
-            along = [parts[f"w_{i}"], parts[f"chi_{i}"]]
-            if self.exact:
-                # A direction of M is a column of dM: by stages side by side again.
-                dM = symbols["dM"][:, i]
-                as_M = ca.reshape(dM, *symbols["M"].shape)
-                along.append(as_M)
-            by_stage = stages(*arguments, *along)
-            jacobian[self._parameters, i] = -ca.sum2(by_stage)
-        results_with_p = {"policy": jacobian, "state": parts["state"]}
-        return define("policy_jacobian", symbols, results_with_p)
+        m = self.problem.n_actions
+        along = [
+            ca.horzcat(*[stage["dw"] for stage in moved]),
+            ca.horzcat(*[stage["dchi"] for stage in moved]),
+        ]
+        if self.exact:
+            along.append(ca.horzcat(*[direction["dM"] for direction in directions]))
+        stages = self._moved_parameter_gradient().map(self.problem.horizon)
+        by_stage = stages(*self._stage_arguments(inputs), *along)
+        # A column a stage, in which those of the directions are one below the other.
+        count = by_stage.size1()
+        columns = ca.reshape(by_stage, count * m, self.problem.horizon)
+        return ca.reshape(ca.sum2(columns), count, m)
 
     @property
     def _parameters(self) -> slice:
@@ -309,8 +487,7 @@ class _Sensitivities:
         xi = symbols["xi"]
         chi = symbols["chi"]
         v = symbols["v"] * action_scale
-        w = ca.vertcat(xi[:, :-1], v)
-        w += reference
+        w = ca.vertcat(xi[:, :-1], v) + reference
         arguments = [
             symbols["x"],
             symbols["u"],
@@ -323,83 +500,28 @@ class _Sensitivities:
         return arguments
 
     def _moved_parameter_gradient(self) -> ca.Function:
-        """Directional derivative of `stage_parameter_gradient` in w, χ and, if exact, M."""
+        """Derivatives (n_p, m) of `stage_parameter_gradient` along directions of w, χ and M."""
+        m = self.problem.n_actions
         stage = self._stage_gradient
         shapes = {name: stage.size_in(name) for name in stage.name_in()}
         arguments = scalar_symbols(shapes)
         moving = ["w", "chi"]
         if self.exact:
             moving.append("M")
-        along = scalar_symbols({f"d{name}": shapes[name] for name in moving})
+        variables = [arguments[name] for name in moving]
+        # A column a direction.
+        along = scalar_symbols({f"d{symbol}": (arguments[symbol].numel(), m) for symbol in moving})
 
         gradient = stage(*arguments.values())
-        variables = [arguments[name] for name in moving]
-        derivative = _derivative_along(gradient, variables, along.values())
+        derivatives = []
+        for i in range(m):
+            direction = [part[:, i] for part in along.values()]
+            derivatives.append(_derivative_along(gradient, variables, direction))
         return stage_function(
             "moved_parameter_gradient",
             {**arguments, **along},
-            {"derivative": derivative},
+            {"derivative": ca.horzcat(*derivatives)},
         )
-
-    def _direction(
-        self,
-        qp: Mapping[str, ca.SX],
-        column: Mapping[str, ca.SX],
-        unit: float,
-    ) -> dict[str, ca.SX]:
-        """An adjoint direction of the whole solution in the model's units, by its parts.
-
-        `column` has its parts of v, t, lam and, with the exact Hessian, M; those of the states and
-        costates follow from the dynamics and the adjoint recursion.
-        """
-        problem = self.problem
-        n = problem.n_states
-        m = problem.n_actions
-        horizon = problem.horizon
-        A = ca.horzsplit(qp["A"], n)
-        B = ca.horzsplit(qp["B"], n)
-        L = ca.horzsplit(qp["L"], n + m)
-        v = ca.reshape(column["dv"], m, horizon)
-        t = ca.reshape(column["dt"], n, horizon)
-        lam = ca.reshape(column["dlam"], n, horizon)
-        controls = ca.horzsplit(v)
-        multipliers = ca.horzsplit(lam)
-
-        # Forward by the dynamics from a state that is given, so does not move.
-        xi = [ca.SX(n, 1)]
-        for k in range(horizon):
-            next_xi = A[k].T @ xi[k] + B[k].T @ controls[k]
-            xi.append(next_xi)
-
-        # Backward by the adjoint recursion; the state of stage k ≥ 1 has the row k−1.
-        next_costate = qp["L_N"] @ xi[horizon] + multipliers[-1]
-        chi = [next_costate]
-        for k in reversed(range(horizon)):
-            w = ca.vertcat(xi[k], controls[k])
-            by_state = L[k] @ w
-            costate = by_state[:n] + A[k] @ next_costate
-            if k:
-                costate += multipliers[k - 1]
-            chi.insert(0, costate)
-            next_costate = costate
-
-        # From the QP's units to the model's, and from its unit right-hand side.
-        scale = problem.scale
-        state = ca.DM(scale.state)
-        action = ca.DM(scale.action) * unit
-        price = ca.DM(scale.state_price)
-        d_xi = [part * state * unit for part in xi]
-        d_chi = [part * price * unit for part in chi]
-        direction = {
-            "xi": ca.horzcat(*d_xi),
-            "v": v * ca.repmat(action, 1, horizon),
-            "t": t * ca.repmat(state * unit, 1, horizon),
-            "lam": lam * ca.repmat(price * unit, 1, horizon),
-            "chi": ca.horzcat(*d_chi),
-        }
-        if self.exact:
-            direction["M"] = column["dM"]
-        return direction
 
 
 def _derivative_along(
@@ -411,11 +533,6 @@ def _derivative_along(
     variable = ca.veccat(*variables)
     moved = ca.veccat(*direction)
     return ca.jtimes(expression, variable, moved)
-
-
-def _call_symbols(inputs: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
-    """Symbols of the same names and shapes for a graph of calls."""
-    return matrix_symbols({name: symbol.shape for name, symbol in inputs.items()})
 
 
 def sensitivities(
@@ -433,7 +550,7 @@ def sensitivities(
         problem: The problem with its model and scale.
         blocks: The blocks of θ.
         exact: Whether the QP's Hessian holds the curvature of the model. Both functions then need
-            M (see `_theta_lagrangian`) and χ̄, the costates where the curvature was taken, the
+            M (see `_Sensitivities.stage`) and χ̄, the costates where the curvature was taken, the
             second also dM, the directional derivative of M.
 
     Returns:

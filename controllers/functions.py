@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -302,6 +303,11 @@ def work_sizes(prefix: str, function: ca.Function) -> dict[str, int]:
     }
 
 
+# CasADi's C asks at each entry whether its argument is there at all. Here all are, and gcc takes
+# twice as long over that many branches.
+_ASKED = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
+_GIVEN = r"arg[\1][\2]"
+
 # Of two zeros of unlike sign CasADi's interpreter returns the first, the C library the second.
 _TIES = (
     ("return fmax(x, y);", "return y > x || x != x ? y : x;"),
@@ -313,10 +319,10 @@ def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     """C99 source of the functions; it needs the mathematical library alone.
 
     Each becomes `int NAME(const double** arg, double** res, long long* iw, double* w, int mem)`,
-    whose arrays must have the sizes of `work_sizes`, and which returns 0 unless it fails. None of
-    them needs a memory checked out, so `mem` is 0. Compiled without contraction of products
-    and sums (-ffp-contract=off) and without fast-math it gives the interpreter's bytes. The same
-    functions give the same source.
+    whose arrays must have the sizes of `work_sizes`, all of whose arguments must be given, and
+    which returns 0 unless it fails. None of them needs a memory checked out, so `mem` is 0.
+    Compiled without contraction of products and sums (-ffp-contract=off) and without fast-math it
+    gives the interpreter's bytes. The same functions give the same source.
 
     Args:
         functions: The functions.
@@ -334,7 +340,7 @@ def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     source = str(generator.dump())
     for library, interpreter in _TIES:
         source = source.replace(library, interpreter)
-    return source
+    return _ASKED.sub(_GIVEN, source)
 
 
 SWITCH = "COSIM_COMPILE"

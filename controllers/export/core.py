@@ -251,7 +251,6 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
         cost_scale=repr(problem.scale.cost),
         rule=rule.source,
         solver=(STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER)[0],
-        stagewise=str(int(stagewise)),
         signal_costs=str(int("SIGNAL" in functions.named)),
         **slack,
     )

@@ -15,16 +15,7 @@
 #include "problem.h"
 
 #include "linearise.h"
-
-/* CasADi's code for a long horizon: gcc makes nothing faster of it by -O3, in three times as long. */
-#if STAGEWISE && defined(__OPTIMIZE__) && !defined(__clang__)
-#pragma GCC push_options
-#pragma GCC optimize("O1")
-#endif
 #include "functions.h"
-#if STAGEWISE && defined(__OPTIMIZE__) && !defined(__clang__)
-#pragma GCC pop_options
-#endif
 
 #include HESSIAN_RULE
 

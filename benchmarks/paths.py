@@ -1,8 +1,8 @@
-"""`python -m benchmarks.paths N_STATES HORIZON …`: condensed beside stage by stage.
+"""`python -m benchmarks.paths N_STATES,HORIZON[,PUMPS] …`: condensed beside stage by stage.
 
 Tanks in series, both paths of the compiled engine on the same states in one process, in turns. It
 prints the processor time of each phase and the ratio that `controllers.rti.nmpc` has its rule from.
-A state count and a horizon for each case, such as `8 10 16 10`.
+Two pumps unless it is said: `8,10 16,10 4,40,1`.
 """
 
 import sys
@@ -18,15 +18,20 @@ REPETITIONS = 5
 SAMPLES = 20
 
 
-def tanks_in_series(n, horizon):
-    """Tanks that empty into each other, two pumps; the cost pulls the last level to its bound."""
-    fed = n // 2
-    flows = np.where(np.arange(n) < fed, 0.5, 1.0)
+def tanks_in_series(n, horizon, pumps=2):
+    """Tanks that empty into each other, each pump into one of them, the first into the first one.
+
+    The cost pulls the last level to its bound.
+    """
+    fed = [i * n // pumps for i in range(pumps)]
+    # At the reference each pump gives a half.
+    flows = 0.5 * np.searchsorted(fed, np.arange(n), side="right")
 
     def ode(x, u, d, p):
         out = flows * ca.sqrt(ca.fmax(x, 1e-3))
-        inflow = ca.vertcat(u[0], out[:-1])
-        inflow[fed] += u[1]
+        inflow = ca.vertcat(0, out[:-1])
+        for i, tank in enumerate(fed):
+            inflow[tank] += u[i]
         return inflow - out
 
     def cost(x, u, d, p):
@@ -35,7 +40,7 @@ def tanks_in_series(n, horizon):
     model = Model(
         name="tanks_in_series",
         states=tuple(Quantity(f"h{i}", "1") for i in range(n)),
-        actions=(Quantity("u0", "1"), Quantity("u1", "1")),
+        actions=tuple(Quantity(f"u{i}", "1") for i in range(pumps)),
         disturbances=(),
         parameters=(),
         ode=ode,
@@ -50,12 +55,12 @@ def tanks_in_series(n, horizon):
         discount=0.99,
         state_lower=state_lower,
         state_upper=np.full(n, 1.1),
-        action_lower=np.zeros(2),
-        action_upper=np.ones(2),
+        action_lower=np.zeros(pumps),
+        action_upper=np.ones(pumps),
         penalty_linear=np.full(n, 100.0),
         penalty_quadratic=np.full(n, 100.0),
         reference_state=np.ones(n),
-        reference_action=np.full(2, 0.5),
+        reference_action=np.full(pumps, 0.5),
         reference_cost=1.0,
     )
 
@@ -72,9 +77,10 @@ def controllers_by_path(problem):
     return controllers
 
 
-def measure(n, horizon):
+def measure(n, horizon, pumps):
     """Print the phases of both paths in µs, and their ratio."""
-    controllers = controllers_by_path(tanks_in_series(n, horizon))
+    case = f"n = {n}, m = {pumps}, N = {horizon}"
+    controllers = controllers_by_path(tanks_in_series(n, horizon, pumps))
     best = {path: dict.fromkeys(PHASES, np.inf) for path in controllers}
     for _ in range(REPETITIONS):
         for path, controller in controllers.items():
@@ -85,12 +91,12 @@ def measure(n, horizon):
         sums[path] = sum(phases.values())
         name = "stage by stage" if path else "condensed"
         parts = ", ".join(f"{phase} {1e6 * phases[phase]:.0f}" for phase in PHASES)
-        print(f"n = {n}, N = {horizon}, {name}: {1e6 * sums[path]:.0f} µs ({parts})")
+        print(f"{case}, {name}: {1e6 * sums[path]:.0f} µs ({parts})")
     ratio = sums[False] / sums[True]
-    print(f"n = {n}, N = {horizon}: condensed takes {ratio:.2f} × stage by stage", flush=True)
+    print(f"{case}: condensed takes {ratio:.2f} × stage by stage", flush=True)
 
 
 if __name__ == "__main__":
-    numbers = [int(word) for word in sys.argv[1:]]
-    for states, stages in zip(numbers[::2], numbers[1::2], strict=True):
-        measure(states, stages)
+    for word in sys.argv[1:]:
+        numbers = [int(number) for number in word.split(",")]
+        measure(*numbers[:2], pumps=numbers[2] if numbers[2:] else 2)

@@ -465,8 +465,8 @@ def growth_over_horizon(problem: Problem) -> float:
     return float(radius**problem.horizon)
 
 
-LONG_HORIZON = 40
-"""Stages from which a QP of any width is solved stage by stage."""
+CROSSING = 15
+"""Stages from which a sweep by stages is faster, where there are no more states than actions."""
 CONDENSING_LIMIT = 400_000
 """Bytes of the stack that the engine's condensing may take: a thread may have no more than 512 kB.
 
@@ -477,9 +477,10 @@ The QP itself and the solver's work are in the engine's arrays, not on the stack
 def solves_by_stage(problem: Problem) -> bool:
     """Whether a compiled engine solves the QP stage by stage and does not condense it.
 
-    Condensing costs a power of the horizon N, a sweep by stages a power of the width n + m: the
-    rule is of n, m and N (`python -m benchmarks.paths` measures both). Where the model is unstable
-    the condensed QP would lose its digits.
+    Condensing and the factor take (N m)³ operations, a sweep by stages N n³: they cross at an N
+    that grows as (n/m)^1.5. Where that is was measured on tanks in series, one level at its bound
+    (`python -m benchmarks.paths`, docs/performance.md). Where the model is unstable the condensed
+    QP would lose its digits.
 
     Args:
         problem: The control problem, whose QP has N stages of n states and m actions.
@@ -487,8 +488,7 @@ def solves_by_stage(problem: Problem) -> bool:
     n = problem.n_states
     m = problem.n_actions
     horizon = problem.horizon
-    # A rule of thumb: where this becomes faster depends on the plant and on θ.
-    long = horizon >= min(5 * (n + m), LONG_HORIZON)
+    long = horizon >= CROSSING * max(1.0, n / m) ** 1.5
     # Responses of each stage's state to all controls, and the factor of the condensed Hessian.
     controls = horizon * m
     responses = (horizon + 1) * n * (controls + n + 1)

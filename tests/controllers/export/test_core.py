@@ -193,7 +193,9 @@ def test_no_controller_takes_more_stack_than_the_limit_that_refuses_it(
         for line in path.read_text().splitlines():
             place, size, _ = line.split("\t")
             frames[place.rpartition(":")[2].partition(".")[0]] = int(size)
-    used = frames["core_sample"] + max(v for name, v in frames.items() if name != "core_sample")
+    # `core_sample` calls what solves, and that a stage's function of the read-out.
+    called = sorted(size for name, size in frames.items() if name != "core_sample")
+    used = frames["core_sample"] + sum(called[-2:])
     monkeypatch.setattr(sys.modules["controllers.export.core"], "STACK_LIMIT", used)
     with pytest.raises(ControllerError, match="kB of stack a sample"):
         core(problem, Parameters.naive(problem), hessian)

@@ -11,6 +11,7 @@ STEPS = {
     "plant": 5000,
     "controllers": 2000,
     "learning": 1000,
+    "estimator": 2000,
     "export": 2000,
     "evaluation": 2000,
     "scaling": 20,

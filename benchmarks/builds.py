@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import patch
 
-from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks
+from controllers import ExtendedKalmanFilter, Parameters, Problem, RtiNmpc, ThetaBlocks
 from controllers.functions import BUILDS, LONG, build_name
 from controllers.policy_table import table_sources
 from cosim.core.files import replacing
@@ -34,7 +34,7 @@ SYSTEMS = {
 
 
 def preset_sources() -> list[dict[str, bytes]]:
-    """C files by name of each library that a preset's controllers and rollouts need.
+    """C files by name of each library that a preset's controllers, filters and rollouts need.
 
     θ has the slack's weights, as in a training, or not; that of rollouts, which `model-based` has
     alone, the model's parameters too.
@@ -48,11 +48,15 @@ def preset_sources() -> list[dict[str, bytes]]:
 
     with (
         patch("controllers.rti.nmpc.library", keep),
+        patch("controllers.filter_engine.library", keep),
         patch("learning.empirical_model.library", keep),
         patch("learning.rollout.library", keep),
     ):
         for preset in presets():
-            problem = Problem.from_scenario(Scenario.load(preset))
+            scenario = Scenario.load(preset)
+            if scenario.sensors:
+                ExtendedKalmanFilter.from_scenario(scenario).compile()
+            problem = Problem.from_scenario(scenario)
             names = tuple(parameter.name for parameter in problem.model.parameters)
             for slack_weights in (False, True):
                 blocks = ThetaBlocks.from_problem(problem, slack_weights=slack_weights)

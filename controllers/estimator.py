@@ -20,21 +20,29 @@ augmented by delayed ones).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import log, pi, sqrt
 from typing import Any, Protocol, Self
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controllers.errors import ControllerError, ModelError, ParameterError
+from controllers.errors import ControllerError, ModelError, ModelWarning, ParameterError, warn
 from controllers.estimator_sensitivities import FilterSensitivities
-from controllers.functions import StackedFunction, define
-from controllers.model import discretise
+from controllers.filter_engine import FilterEngine
+from controllers.filter_model import bound_widths, filter_model
+from controllers.functions import (
+    COMPILED,
+    INTERPRETED,
+    LONG,
+    StackedFunction,
+    consecutive,
+    not_in_c,
+    worth_compiling,
+)
 from controllers.problem import Problem
-from controllers.rti import RtiSolution
+from controllers.rti import RtiSolution, compile_functions
 from controllers.theta import Parameters, ThetaBlocks, noise_block
 from cosim.core.modules import load_plugin
 from cosim.core.protocols import Controller, Matrix, Solution, Vector
@@ -42,10 +50,6 @@ from cosim.core.scenario import EstimatorTable, Scenario, SensorTable
 
 EXPECTED_DISTURBANCE = 0.1
 """Deviation that is expected of a disturbance, as a share of its magnitude."""
-INITIAL_DEVIATION = 0.1
-"""Deviation of the first state from the reference, as a share of the width of its bounds."""
-UNCERTAIN = 0.1
-"""Deviation of an uncertain parameter from its nominal value at the start, as a share of this."""
 DRIFT_PERIOD = 86400.0
 """Seconds in which an uncertain parameter changes by `parameter_drift`."""
 EXACT = 1e-6
@@ -123,44 +127,137 @@ class ExtendedKalmanFilter:
         differentiates: bool = False,
     ) -> None:
         self._problem = problem
-        self._sensors = tuple(sensors)
-        self._delays = np.array([sensor.delay for sensor in sensors])
-        self._longest = int(self._delays.max())
         model = problem.model
         self._uncertain = model.parameter_indices(model.uncertain) if parameter_drift > 0 else []
-        self._transition = _transition_function(problem, self._uncertain)
-        self._output = measured_outputs(problem, sensors, self._uncertain)
-        # The filter's state z: the model's, and its uncertain parameters.
-        nominal = model.nominal_parameters[self._uncertain]
-        self._reference = np.concatenate([problem.reference_state, nominal])
-        self._n = self._reference.size
-        share = parameter_drift * np.sqrt(problem.sampling_time / DRIFT_PERIOD)
-        self._drift_variance = (share * np.abs(nominal)) ** 2
-        self._initial_deviation = np.concatenate(
-            [INITIAL_DEVIATION * _widths(problem), UNCERTAIN * np.abs(nominal)]
-        )
-        if disturbance_deviation is None:
-            expected = EXPECTED_DISTURBANCE * model.disturbance_magnitudes
-        else:
-            expected = _of_size("disturbance_deviation", disturbance_deviation, model.disturbances)
-        self._disturbance_variance = expected**2
-        if sensor_deviation is None:
-            deviations = np.array([sensor.deviation for sensor in sensors])
-        else:
-            deviations = _of_size("sensor_deviation", sensor_deviation, self._sensors)
-        self._sensor_variance = np.maximum(deviations, EXACT * self._sizes_of_outputs()) ** 2
+        self.model = filter_model(problem, sensors, self._uncertain)
+        self._transition = StackedFunction(self.model.transition)
+        self._output = StackedFunction(self.model.output)
+        self._n = self.model.start.size
+        self._engine: FilterEngine | None = None
+        self.functions = INTERPRETED
+        self._view_memory()
         self.noise_labels = (
             *(f"disturbance {quantity.name}" for quantity in model.disturbances),
             *(f"parameter {model.parameters[i].name}" for i in self._uncertain),
             *(f"sensor {sensor.variable}" for sensor in sensors),
         )
+        if disturbance_deviation is None:
+            expected = EXPECTED_DISTURBANCE * model.disturbance_magnitudes
+        else:
+            expected = _of_size("disturbance_deviation", disturbance_deviation, model.disturbances)
+        self._disturbance_variance[:] = expected**2
+        nominal = model.nominal_parameters[self._uncertain]
+        share = parameter_drift * np.sqrt(problem.sampling_time / DRIFT_PERIOD)
+        self._drift_variance[:] = (share * np.abs(nominal)) ** 2
+        if sensor_deviation is None:
+            deviations = np.array([sensor.deviation for sensor in sensors])
+        else:
+            deviations = _of_size("sensor_deviation", sensor_deviation, sensors)
+        self._sensor_variance[:] = np.maximum(deviations, EXACT * self._sizes_of_outputs()) ** 2
         self.sensitivities: FilterSensitivities | None = None
         if differentiates:
             self.sensitivities = FilterSensitivities(
-                self._transition, self._output, self._longest + 1, len(self._uncertain)
+                self._transition, self._output, self.model.n_kept, len(self._uncertain)
             )
         self._check_observability()
         self.reset()
+
+    def _view_memory(self) -> None:
+        """Make the memory, in the order of FilterMemory in C, and name its parts."""
+        model = self.model
+        n_sensors = len(model.delays)
+        n_all = model.n_kept * self._n
+        sizes = {
+            "action": model.transition.inputs["u"],
+            "y": n_sensors,
+            "standardised": n_sensors,
+            "log_likelihood": 1,
+            "disturbance_variance": model.n_disturbances,
+            "drift_variance": model.n_drifts,
+            "sensor_variance": n_sensors,
+            "states": n_all,
+            "covariance": n_all * n_all,
+        }
+        places = consecutive(sizes)
+        memory = np.zeros(sum(sizes.values()))
+        self._memory: Vector = memory
+        self._action = memory[places["action"]]
+        self._y = memory[places["y"]]
+        self.standardised: Vector = memory[places["standardised"]]
+        self._log_likelihood = memory[places["log_likelihood"]]
+        self._disturbance_variance = memory[places["disturbance_variance"]]
+        self._drift_variance = memory[places["drift_variance"]]
+        self._sensor_variance = memory[places["sensor_variance"]]
+        # One after the other, as in `noise`.
+        first = places["disturbance_variance"].start
+        self._variances = memory[first : places["sensor_variance"].stop]
+        # The present z and, behind it, those of earlier samples.
+        self._states = memory[places["states"]].reshape(model.n_kept, self._n)
+        self._covariance = memory[places["covariance"]].reshape(n_all, n_all)
+        self._estimate = self._states[0, : self._problem.n_states]
+
+    def compile(self, samples: int = LONG) -> None:
+        """Compile for a run of `samples`, if it is long enough.
+
+        As with a controller: COSIM_COMPILE=never forbids it, `now` compiles for any number, and
+        without a compiler CasADi's functions and NumPy stay. Both give the same to rounding.
+        `functions` says which of them it is.
+        """
+        if self.functions == COMPILED or not worth_compiling(samples):
+            return
+        reason = not_in_c([self.model.transition.function, self.model.output.function])
+        if reason is not None:
+            warn(f"{reason}: the estimator is not compiled, which is slower", ModelWarning)
+            return
+        slopes = None if self.sensitivities is None else self.sensitivities.memory
+        engine = FilterEngine.compile(self.model, self._memory, slopes)
+        if engine is None:
+            return
+        # A library that differs from the interpreter is refused: it would give wrong numbers fast.
+        if not self._agrees_with(engine):
+            warn(
+                "the C compiler makes other numbers of the model than CasADi does: the estimator "
+                "is not compiled, which is slower; set CC to another compiler",
+                ModelWarning,
+            )
+            return
+        self._engine = engine
+        self.functions = COMPILED
+
+    def _agrees_with(self, engine: FilterEngine) -> bool:
+        """Whether a sample in compiled code is as here but for rounding, from start and reference.
+
+        The memory stays as it is.
+        """
+        memories = [self._memory]
+        if self.sensitivities is not None:
+            memories.append(self.sensitivities.memory)
+        saved = [memory.copy() for memory in memories]
+        results = []
+        for chosen in (engine, None):
+            self._engine = chosen
+            self.reset()
+            for _ in range(2):
+                self.predict(self._problem.reference_action)
+                self.correct(np.zeros(len(self.model.delays)))
+            results.append(self._scaled())
+        for memory, content in zip(memories, saved, strict=True):
+            memory[:] = content
+        compiled, interpreted = results
+        return np.allclose(compiled, interpreted, rtol=1e-9, atol=1e-9, equal_nan=True)
+
+    def _scaled(self) -> Vector:
+        """All z and covariances, their derivatives too, in units of the deviations at the start."""
+        deviation = self.model.start_deviation
+        unit = np.tile(np.where(deviation > 0.0, deviation, 1.0), self.model.n_kept)
+        outer = np.outer(unit, unit)
+        parts = [self._states.ravel() / unit, self._covariance / outer, self._log_likelihood]
+        if self.sensitivities is not None:
+            by_noise = self.sensitivities
+            parts.append(by_noise.states.reshape(by_noise.size, -1) / unit)
+            parts.append(by_noise.covariance / outer)
+            parts.append(by_noise.log_likelihood)
+        return np.concatenate([part.ravel() for part in parts])
 
     @classmethod
     def from_scenario(cls, scenario: Scenario, *, differentiates: bool = False) -> Self:
@@ -183,30 +280,28 @@ class ExtendedKalmanFilter:
     def reset(self) -> None:
         """Forget every reading: the reference, and the initial deviation about it."""
         n = self._n
-        # The present z and, behind it, those of earlier samples.
-        self._states = np.tile(self._reference, (self._longest + 1, 1))
-        self._covariance = np.zeros((self._states.size, self._states.size))
-        self._covariance[:n, :n] = np.diag(self._initial_deviation**2)
-        self.log_likelihood = 0.0
-        self.standardised = np.full(self._delays.size, np.nan)
+        self._states[:] = self.model.start
+        self._covariance[:] = 0.0
+        self._covariance[:n, :n] = np.diag(self.model.start_deviation**2)
+        self._log_likelihood[0] = 0.0
+        self.standardised[:] = np.nan
         if self.sensitivities is not None:
             self.sensitivities.reset()
 
     @property
+    def log_likelihood(self) -> float:
+        """Of all readings since the last `reset`, by their innovations."""
+        return float(self._log_likelihood[0])
+
+    @property
     def noise(self) -> Vector:
         """Logarithms of the variances that `noise_labels` names, (q,), in the variables' units."""
-        variances = [self._disturbance_variance, self._drift_variance, self._sensor_variance]
-        logarithms: Vector = np.log(np.concatenate(variances))
+        logarithms: Vector = np.log(self._variances)
         return logarithms
 
     @noise.setter
     def noise(self, noise: ArrayLike) -> None:
-        variances = np.exp(_of_size("noise", noise, self.noise_labels))
-        first_sensor = variances.size - self._delays.size
-        first_drift = first_sensor - len(self._uncertain)
-        self._disturbance_variance = variances[:first_drift]
-        self._drift_variance = variances[first_drift:first_sensor]
-        self._sensor_variance = variances[first_sensor:]
+        self._variances[:] = np.exp(_of_size("noise", noise, self.noise_labels))
 
     def add_noise(self, parameters: Parameters) -> Parameters:
         """θ with this filter's `noise` as a block, its last; θ itself where it has one.
@@ -222,7 +317,7 @@ class ExtendedKalmanFilter:
     @property
     def estimate(self) -> Vector:
         """Of the present state, (n,)."""
-        return self._states[0, : self._problem.n_states].copy()
+        return self._estimate.copy()
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -246,17 +341,30 @@ class ExtendedKalmanFilter:
 
     def load_state_dict(self, state: Mapping[str, Vector]) -> None:
         """Restore what `state_dict` returned."""
-        self._states = state["states"].copy()
-        self._covariance = state["covariance"].copy()
+        self._states[:] = state["states"]
+        self._covariance[:] = state["covariance"]
         if self.sensitivities is not None:
             self.sensitivities.load_state_dict(state)
 
     def predict(self, a: ArrayLike) -> None:
-        """Go on by a sample.
+        """Go on by a sample; a prediction that is not finite makes it forget every reading.
 
         Args:
             a: Action that was applied, (m,).
         """
+        if self._engine is None:
+            self._predict(a)
+            finite = bool(np.isfinite(self._states[0]).all())
+        else:
+            self._action[:] = a
+            finite = self._engine.predict()
+        if not finite:
+            # From what is not finite no reading leads back, and nothing is known of their law.
+            self.reset()
+            self._log_likelihood[0] = np.nan
+
+    def _predict(self, a: ArrayLike) -> None:
+        """`predict`, by CasADi's functions and NumPy."""
         n = self._n
         step = self._transition
         step.inputs["z"][:] = self._states[0]
@@ -271,19 +379,17 @@ class ExtendedKalmanFilter:
         # Every state moves back by one sample, the oldest is forgotten.
         kept = self._covariance[: self._covariance.shape[0] - n, : self._covariance.shape[0] - n]
         across = A @ self._covariance[:n]
-        moved = np.empty_like(self._covariance)
         noise = (G * self._disturbance_variance) @ G.T
         # What drifts are the last entries of z.
         drifting = range(n - len(self._uncertain), n)
         noise[drifting, drifting] += self._drift_variance
-        moved[:n, :n] = across[:, :n] @ A.T + noise
-        if self._longest:
-            moved[n:, n:] = kept
-            moved[:n, n:] = across[:, : len(kept)]
-            moved[n:, :n] = moved[:n, n:].T
+        if self.model.n_kept > 1:
+            self._covariance[n:, n:] = kept.copy()
+            self._covariance[:n, n:] = across[:, : len(kept)]
+            self._covariance[n:, :n] = self._covariance[:n, n:].T
             self._states[1:] = self._states[:-1].copy()
+        self._covariance[:n, :n] = across[:, :n] @ A.T + noise
         self._states[0] = step.part("z_next")
-        self._covariance = moved
 
     def correct(self, y: ArrayLike) -> Vector:
         """Take up the readings of a sample.
@@ -298,21 +404,34 @@ class ExtendedKalmanFilter:
             ControllerError: y has another shape or is infinite.
         """
         readings = np.asarray(y, dtype=np.float64)
-        if readings.shape != self._delays.shape or np.isinf(readings).any():
-            raise ControllerError(
-                f"y must be {self._delays.size} readings, NaN where there is none, not {readings}"
-            )
+        if readings.shape != self._y.shape:
+            raise self._unfit(readings)
+        self._y[:] = readings
+        taken = self._correct() if self._engine is None else self._engine.correct()
+        if not taken:
+            raise self._unfit(readings)
+        return self._estimate.copy()
+
+    def _unfit(self, readings: Vector) -> ControllerError:
+        """The error of readings that cannot be taken up."""
+        return ControllerError(
+            f"y must be {self._y.size} readings, NaN where there is none, not {readings}"
+        )
+
+    def _correct(self) -> bool:
+        """`correct`, by CasADi's functions and NumPy; False where a reading is infinite."""
+        if np.isinf(self._y).any():
+            return False
         self.standardised[:] = np.nan
-        arrived = np.flatnonzero(~np.isnan(readings))
         # One after the other: their noises are independent, so that nothing is inverted.
-        for i in arrived.tolist():
-            self._correct_by(i, float(readings[i]))
-        return self.estimate
+        for i in np.flatnonzero(~np.isnan(self._y)).tolist():
+            self._correct_by(i, float(self._y[i]))
+        return True
 
     def _correct_by(self, i: int, reading: float) -> None:
         """Take up the reading of sensor i."""
         n = self._n
-        delay = int(self._delays[i])
+        delay = self.model.delays[i]
         output = self._output
         output.inputs["z"][:] = self._states[delay]
         output()
@@ -324,7 +443,7 @@ class ExtendedKalmanFilter:
         gain = across / variance
         innovation = reading - output.part("y")[i]
         self.standardised[i] = innovation / sqrt(variance)
-        self.log_likelihood -= (innovation**2 / variance + log(2 * pi * variance)) / 2
+        self._log_likelihood[0] -= (innovation**2 / variance + log(2 * pi * variance)) / 2
         if self.sensitivities is not None:
             self.sensitivities.correct(
                 i,
@@ -354,11 +473,11 @@ class ExtendedKalmanFilter:
 
     def _sizes_of_outputs(self) -> Vector:
         """Size of each sensor's variable over the bounds' widths about the reference, (n_y,)."""
-        self._output.inputs["z"][:] = self._reference
+        self._output.inputs["z"][:] = self.model.start
         self._output()
         n_states = self._problem.n_states
         sensitivity = np.abs(self._output.matrix("C").T[:, :n_states])
-        sizes: Vector = sensitivity @ _widths(self._problem)
+        sizes: Vector = sensitivity @ bound_widths(self._problem)
         return sizes
 
     def _check_observability(self) -> None:
@@ -366,11 +485,11 @@ class ExtendedKalmanFilter:
         problem = self._problem
         step = self._transition
         n = problem.n_states
-        step.inputs["z"][:] = self._reference
+        step.inputs["z"][:] = self.model.start
         step.inputs["u"][:] = problem.reference_action
         step()
         # In the widths of the bounds, so that no unit decides.
-        widths = _widths(problem)
+        widths = bound_widths(problem)
         A = step.matrix("A").T[:n, :n] * widths / widths[:, None]
         C = self._output.matrix("C").T[:, :n] * widths
         C = C / np.abs(C).max(axis=1, keepdims=True)
@@ -445,6 +564,7 @@ class OutputFeedback:
         self.estimator = estimator
         self.controller = controller
         self._noise_place: slice | None = None
+        self._noise_of: Vector | None = None
         parameters = getattr(controller, "parameters", None)
         if isinstance(parameters, Parameters) and "noise" in parameters.blocks:
             _require_noise_of(estimator, parameters.blocks.block("noise").labels)
@@ -503,6 +623,19 @@ class OutputFeedback:
         """Of the present state, (n,)."""
         return self.estimator.estimate.copy()
 
+    @property
+    def functions(self) -> str:
+        """`compiled` where controller and estimator both are, `interpreted` else."""
+        of_controller: str = getattr(self.controller, "functions", INTERPRETED)
+        of_estimator = getattr(self.estimator, "functions", of_controller)
+        return of_controller if of_estimator == COMPILED else of_estimator
+
+    def compile(self, samples: int = LONG) -> None:
+        """Compile controller and filter for a run of `samples`, if it is long enough."""
+        compile_functions(self.controller, samples)
+        if isinstance(self.estimator, ExtendedKalmanFilter):
+            self.estimator.compile(samples)
+
     def reset(self) -> None:
         """Forget every earlier sample."""
         self.estimator.reset()
@@ -544,7 +677,7 @@ class OutputFeedback:
         if not self._is_corrected:
             self.estimator.correct(np.asarray(y, dtype=np.float64))
             self._is_corrected = True
-        solution = self.controller.feedback(self.estimator.estimate.copy(), a)
+        solution = self.controller.feedback(self.estimator.estimate, a)
         if self._noise_place is not None:
             solution = self._differentiated(solution)
         self.applied(solution.action if a is None else a)
@@ -552,7 +685,9 @@ class OutputFeedback:
 
     def _set_noise(self) -> None:
         """Give the estimator the variances of θ."""
-        if self._noise_place is not None:
+        # θ is never written into: a θ that has moved is another array.
+        if self._noise_place is not None and self.theta is not self._noise_of:
+            self._noise_of = self.theta
             self.estimator.noise = self.theta[self._noise_place]  # type: ignore[attr-defined]
 
     def _differentiated(self, solution: Any) -> EstimatedSolution:
@@ -560,8 +695,16 @@ class OutputFeedback:
         assert self._noise_place is not None
         n = self.estimator.estimate.size
         by_noise = self.estimator.sensitivities.states[:, 0, :n].copy()  # type: ignore[attr-defined]
-        known = {part.name: getattr(solution, part.name) for part in fields(RtiSolution)}
-        return EstimatedSolution(**known, place=self._noise_place, by_noise=by_noise)
+        return EstimatedSolution(
+            action=solution.action,
+            value=solution.value,
+            prepared=solution.prepared,
+            memory=solution.memory,
+            enforced=solution.enforced,
+            status=solution.status,
+            place=self._noise_place,
+            by_noise=by_noise,
+        )
 
     def applied(self, a: Vector) -> None:
         """Say which action (m,) was applied, where it is not the solution's own."""
@@ -604,69 +747,3 @@ def _of_size(name: str, values: ArrayLike, counted: Sequence[object]) -> Vector:
     if array.shape != (len(counted),):
         raise ModelError(f"estimator.{name} must have {len(counted)} entries, not {array.size}")
     return array
-
-
-def _widths(problem: Problem) -> Vector:
-    """Widths of the states' bounds, (n,); where there is no bound the reference's size."""
-    widths = problem.state_upper - problem.state_lower
-    return np.where(np.isfinite(widths), widths, np.abs(problem.reference_state))
-
-
-def _with_uncertain(problem: Problem, uncertain: Sequence[int]) -> tuple[ca.SX, ca.SX]:
-    """Symbols z of states and uncertain parameters, and p with these in their places."""
-    model = problem.model
-    z = ca.SX.sym("z", problem.n_states + len(uncertain))
-    p = ca.SX(ca.DM(model.nominal_parameters))
-    for place, index in enumerate(uncertain):
-        p[index] = z[problem.n_states + place]
-    return z, p
-
-
-def _transition_function(problem: Problem, uncertain: Sequence[int]) -> StackedFunction:
-    """z₊, A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u)."""
-    model = problem.model
-    f = discretise(model, problem.sampling_time, problem.substeps)
-    z, p = _with_uncertain(problem, uncertain)
-    _, u, d, _ = model.symbols()
-    x_next: Any = f(z[: problem.n_states], u, d, p)
-    z_next = ca.vertcat(x_next, z[problem.n_states :])
-    derivatives: Any = ca.Function(
-        "derivatives", [z, u, d], [z_next, ca.jacobian(z_next, z), ca.jacobian(z_next, d)]
-    )
-    value, A, G = derivatives(z, u, ca.SX(ca.DM(model.nominal_disturbance)))
-    results = {"z_next": value, "A": A, "G": G}
-    return StackedFunction(define("estimator_transition", {"z": z, "u": u}, results))
-
-
-def measured_outputs(
-    problem: Problem, sensors: Sequence[SensorTable], uncertain: Sequence[int] = ()
-) -> StackedFunction:
-    """What sensors read of the model: `y` (n_y,) and C = ∂y/∂z, by z.
-
-    Args:
-        problem: Has the model.
-        sensors: Name the states and outputs of the model.
-        uncertain: Places of the parameters that z has behind the states; the others are nominal.
-
-    Raises:
-        ModelError: A sensor reads what is neither a state nor an output.
-    """
-    model = problem.model
-    z, p = _with_uncertain(problem, uncertain)
-    x = z[: problem.n_states]
-    _, u, d, _ = model.symbols()
-    names = [quantity.name for quantity in model.states]
-    rows = []
-    for variable in (sensor.variable for sensor in sensors):
-        if variable in model.outputs:
-            rows.append(model.outputs[variable](x, u, d, p))
-        elif variable in names:
-            rows.append(x[names.index(variable)])
-        else:
-            raise ModelError(
-                f"a [[sensor]] reads '{variable}', which is neither a state nor an output of model "
-                f"'{model.name}': give it to the model, Model(outputs={{'{variable}': …}})"
-            )
-    y = ca.vertcat(*rows)
-    results = {"y": y, "C": ca.jacobian(y, z)}
-    return StackedFunction(define("estimator_output", {"z": z}, results))

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 
-from controllers.functions import StackedFunction, define
+from controllers.functions import StackedFunction, consecutive, define
 from cosim.core.protocols import Array, Vector
 
 
@@ -30,6 +30,7 @@ class FilterSensitivities:
         n_drifts: Number of parameters, the last entries of z, that drift.
 
     Attributes:
+        memory: All of them in one array.
         states: dẑ/dη of each sample that is kept, (q, n_kept, n).
         covariance: dP/dη, (q, n_kept n, n_kept n).
         log_likelihood: By η, of the readings since the last reset, (q,).
@@ -51,14 +52,20 @@ class FilterSensitivities:
         self.size = self._n_disturbances + n_drifts + self._n_sensors
         self._transition_by_z = _by_z(transition, self.size)
         self._output_by_z = _by_z(output, self.size)
-        self.reset()
+        # One array, in the order of FilterSlopes in C.
+        n_all = n_kept * self._n
+        sizes = {"states": self.size * n_all, "covariance": self.size * n_all**2}
+        places = consecutive(sizes | {"log_likelihood": self.size})
+        self.memory: Vector = np.zeros(places["log_likelihood"].stop)
+        states = self.memory[places["states"]]
+        self.states: Array = states.reshape(self.size, n_kept, self._n)
+        covariance = self.memory[places["covariance"]]
+        self.covariance: Array = covariance.reshape(self.size, n_all, n_all)
+        self.log_likelihood: Vector = self.memory[places["log_likelihood"]]
 
     def reset(self) -> None:
         """Forget every reading: where the filter starts does not depend on η."""
-        n_all = self._n_kept * self._n
-        self.states: Array = np.zeros((self.size, self._n_kept, self._n))
-        self.covariance: Array = np.zeros((self.size, n_all, n_all))
-        self.log_likelihood: Vector = np.zeros(self.size)
+        self.memory[:] = 0.0
 
     def state_dict(self) -> dict[str, Vector]:
         """All derivatives of what the filter remembers."""
@@ -69,8 +76,8 @@ class FilterSensitivities:
 
     def load_state_dict(self, state: Mapping[str, Vector]) -> None:
         """Restore what `state_dict` returned."""
-        self.states = state["states_by_noise"].copy()
-        self.covariance = state["covariance_by_noise"].copy()
+        self.states[:] = state["states_by_noise"]
+        self.covariance[:] = state["covariance_by_noise"]
 
     def predict(
         self,
@@ -109,15 +116,11 @@ class FilterSensitivities:
             present[self._n_disturbances + i, place, place] += variance
 
         if self._n_kept > 1:
-            moved = np.empty_like(self.covariance)
-            moved[:, n:, n:] = self.covariance[:, :-n, :-n]
-            moved[:, :n, n:] = across[:, :, :-n]
-            moved[:, n:, :n] = moved[:, :n, n:].swapaxes(1, 2)
-            moved[:, :n, :n] = present
-            self.covariance = moved
+            self.covariance[:, n:, n:] = self.covariance[:, :-n, :-n].copy()
+            self.covariance[:, :n, n:] = across[:, :, :-n]
+            self.covariance[:, n:, :n] = self.covariance[:, :n, n:].swapaxes(1, 2)
             self.states[:, 1:] = self.states[:, :-1].copy()
-        else:
-            self.covariance = present
+        self.covariance[:, :n, :n] = present
         self.states[:, 0] = by_noise[:, step.slices["z_next"]]
 
     def correct(

@@ -10,8 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from controllers.estimator import EXPECTED_DISTURBANCE, measured, measured_outputs
+from controllers.estimator import EXPECTED_DISTURBANCE, measured
 from controllers.factories import nmpc, tuned
+from controllers.filter_model import measured_outputs
 from controllers.functions import StackedFunction, define
 from controllers.model import discretise
 from controllers.problem import Problem

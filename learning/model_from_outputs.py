@@ -56,6 +56,7 @@ class ModelFromOutputs(Algorithm):
                 "and noise=false"
             )
         self._filter = ExtendedKalmanFilter.from_scenario(self.scenario, differentiates=True)
+        self._filter.compile()
         self._prior_mean = self._filter.noise
         self._plant = FittedPlant(self.scenario, start, settings.normal_errors)
         problem = Problem.from_scenario(self.scenario)
@@ -255,6 +256,7 @@ class FittedPlant:
         self._controller = nmpc(scenario, _without_noise(parameters))
         self._controller.compile()
         self._filter = ExtendedKalmanFilter.from_scenario(scenario)
+        self._filter.compile()
         self._law = OutputFeedback(self._filter, self._controller)
         self._state: dict[str, Vector] = {}
 

@@ -126,8 +126,8 @@ def controller_sources(
     for prefix, part in functions.named.items():
         if prefix not in unused:
             called.append(part.function)
-    sources["linearise.h"] = _functions("linearise", [functions.stage])
-    sources["functions.h"] = _functions("functions", called)
+    sources["linearise.h"] = static_functions("linearise", [functions.stage])
+    sources["functions.h"] = static_functions("functions", called)
     sources["problem.h"] = _constants(functions, stagewise).encode()
     return sources
 
@@ -172,13 +172,18 @@ def stack_needed(functions: SampleFunctions) -> int:
     return 4000 + round(1.2 * bytes_needed)
 
 
-def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
-    """CasADi's C with every function static and without the compiler's remarks on it."""
+def static_functions(name: str, functions: Sequence[ca.Function]) -> bytes:
+    """CasADi's C with every function static and without the compiler's remarks on it.
+
+    Args:
+        name: What the names of its helpers begin with.
+        functions: The functions.
+    """
     # All is included in one file, next to others' code: no name may leave it.
     helper = re.compile(r"^(?:const )?(?:casadi_real|casadi_int|void|int)\*? casadi_", re.MULTILINE)
     code = c_source(functions, name)
     code = helper.sub(lambda match: f"static {match.group()}", code)
-    return _filled("functions.h.in", code=code).encode()
+    return filled("functions.h.in", code=code).encode()
 
 
 def _constants(functions: SampleFunctions, stagewise: bool) -> str:
@@ -239,9 +244,9 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
     arrays |= _moving_bound_rows(problem)
     arrays["DISCOUNTS"] = problem.discounts[:-1]
     arrays["SLACK_DISCOUNTS"] = problem.discounts[1:]
-    array_lines = [_array_text(name, values) for name, values in arrays.items()]
+    array_lines = [array_text(name, values) for name, values in arrays.items()]
     end_discount = float(problem.discounts[-1])
-    return _filled(
+    return filled(
         "problem.h.in",
         sizes="\n".join(size_lines),
         arrays="\n".join(array_lines),
@@ -271,12 +276,14 @@ def _moving_bound_rows(problem: Problem) -> dict[str, Vector]:
     return arrays
 
 
-def _filled(template: str, **values: str) -> str:
+def filled(template: str, **values: str) -> str:
+    """A template of `ENGINE_SOURCES` with values in the places of their names."""
     text = (ENGINE_SOURCES / template).read_text(encoding="utf-8")
     return Template(text).substitute(values)
 
 
-def _array_text(name: str, values: ArrayLike) -> str:
+def array_text(name: str, values: ArrayLike) -> str:
+    """A constant array of doubles in C."""
     # `repr` gives back the same double: a constant in C has no rounding of its own.
     array = np.asarray(values, dtype=np.float64)
     numbers = ", ".join(_number(value) for value in array)

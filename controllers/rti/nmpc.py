@@ -1418,10 +1418,12 @@ class RtiNmpc:
 
 
 def compile_functions(controller: object, samples: int = LONG) -> None:
-    """Compile the controller if it is an `RtiNmpc`, behind an estimator too; no other."""
-    nmpc = getattr(controller, "controller", controller)
-    if isinstance(nmpc, RtiNmpc) and nmpc.functions == INTERPRETED:
-        nmpc.compile(samples)
+    """Compile the controller if it is an `RtiNmpc`, and the estimator before it; no other."""
+    if isinstance(controller, RtiNmpc):
+        if controller.functions == INTERPRETED:
+            controller.compile(samples)
+    elif isinstance(getattr(controller, "controller", None), RtiNmpc):
+        controller.compile(samples)  # type: ignore[attr-defined]
 
 
 def _alike(one: Vector, other: Vector) -> bool:

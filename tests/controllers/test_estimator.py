@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from controllers import ControllerError, ExtendedKalmanFilter, Model, OutputFeedback, Quantity
 from controllers.errors import ModelError
-from controllers.estimator import INITIAL_DEVIATION
+from controllers.filter_model import INITIAL_DEVIATION
 from controllers.model import discretise
 from controllers.problem import Problem
 from cosim import FmuPlant, Scenario, simulate

@@ -1,0 +1,177 @@
+"""What an extended Kalman filter computes with: the model's step, its outputs, where it starts.
+
+The filter's state z is the model's, and behind it the parameters that the model calls uncertain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from controllers.errors import ModelError
+from controllers.functions import Definition, StackedFunction, define
+from controllers.model import discretise
+from controllers.problem import Problem
+from cosim.core.protocols import Vector
+from cosim.core.scenario import SensorTable
+
+INITIAL_DEVIATION = 0.1
+"""Deviation of the first state from the reference, as a share of the width of its bounds."""
+UNCERTAIN = 0.1
+"""Deviation of an uncertain parameter from its nominal value at the start, as a share of this."""
+
+
+@dataclass(frozen=True, eq=False)
+class FilterModel:
+    """A model and its sensors, as a filter has them.
+
+    Attributes:
+        transition: z₊ (`z_next`), A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u).
+        output: What the sensors read, `y` (n_y,), and C = ∂y/∂z, by z.
+        delays: Samples from a reading of each sensor to its arrival.
+        n_drifts: Number of uncertain parameters, the last entries of z.
+        start: z before the first reading, (n,).
+        start_deviation: Expected deviations of z from there, (n,).
+    """
+
+    transition: Definition
+    output: Definition
+    delays: tuple[int, ...]
+    n_drifts: int
+    start: Vector
+    start_deviation: Vector
+
+    @property
+    def n_disturbances(self) -> int:
+        """Number of disturbances."""
+        return self.transition.shapes["G"][1]
+
+    @property
+    def n_kept(self) -> int:
+        """How many samples of z the filter keeps: the present one, and those of late readings."""
+        return max(self.delays) + 1
+
+    @property
+    def n_noises(self) -> int:
+        """Number of variances: of disturbances, drifts and sensors."""
+        return self.n_disturbances + self.n_drifts + len(self.delays)
+
+
+def filter_model(
+    problem: Problem, sensors: Sequence[SensorTable], uncertain: Sequence[int]
+) -> FilterModel:
+    """What a filter on a problem's model computes with.
+
+    Args:
+        problem: Has the model with its nominal disturbances and parameters, and the reference.
+        sensors: Name the states and outputs of the model.
+        uncertain: Places of the parameters that are states of the filter.
+
+    Raises:
+        ModelError: A sensor reads what is neither a state nor an output.
+    """
+    nominal = problem.model.nominal_parameters[list(uncertain)]
+    deviations = (INITIAL_DEVIATION * bound_widths(problem), UNCERTAIN * np.abs(nominal))
+    return FilterModel(
+        transition=_transition(problem, uncertain),
+        output=_output(problem, sensors, uncertain),
+        delays=tuple(sensor.delay for sensor in sensors),
+        n_drifts=len(uncertain),
+        start=np.concatenate([problem.reference_state, nominal]),
+        start_deviation=np.concatenate(deviations),
+    )
+
+
+def bound_widths(problem: Problem) -> Vector:
+    """Widths of the states' bounds, (n,); where there is no bound the reference's size.
+
+    Args:
+        problem: The problem.
+    """
+    widths = problem.state_upper - problem.state_lower
+    return np.where(np.isfinite(widths), widths, np.abs(problem.reference_state))
+
+
+def _with_uncertain(problem: Problem, uncertain: Sequence[int]) -> tuple[ca.SX, ca.SX]:
+    """Symbols z of states and uncertain parameters, and p with these in their places."""
+    model = problem.model
+    z = ca.SX.sym("z", problem.n_states + len(uncertain))
+    p = ca.SX(ca.DM(model.nominal_parameters))
+    for place, index in enumerate(uncertain):
+        p[index] = z[problem.n_states + place]
+    return z, p
+
+
+def _transition(problem: Problem, uncertain: Sequence[int]) -> Definition:
+    """z₊, A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u)."""
+    model = problem.model
+    f = discretise(model, problem.sampling_time, problem.substeps)
+    z, p = _with_uncertain(problem, uncertain)
+    _, u, d, _ = model.symbols()
+    x_next: Any = f(z[: problem.n_states], u, d, p)
+    z_next = ca.vertcat(x_next, z[problem.n_states :])
+    derivatives: Any = ca.Function(
+        "derivatives", [z, u, d], [z_next, ca.jacobian(z_next, z), ca.jacobian(z_next, d)]
+    )
+    value, A, G = derivatives(z, u, ca.SX(ca.DM(model.nominal_disturbance)))
+    results = {"z_next": value, "A": A, "G": G}
+    return define("estimator_transition", {"z": z, "u": u}, results)
+
+
+def _output(
+    problem: Problem, sensors: Sequence[SensorTable], uncertain: Sequence[int]
+) -> Definition:
+    """`y` (n_y,) and C = ∂y/∂z, by z."""
+    model = problem.model
+    z, p = _with_uncertain(problem, uncertain)
+    x = z[: problem.n_states]
+    _, u, d, _ = model.symbols()
+    names = [quantity.name for quantity in model.states]
+    rows = []
+    for variable in (sensor.variable for sensor in sensors):
+        if variable in model.outputs:
+            rows.append(model.outputs[variable](x, u, d, p))
+        elif variable in names:
+            rows.append(x[names.index(variable)])
+        else:
+            raise ModelError(
+                f"a [[sensor]] reads '{variable}', which is neither a state nor an output of model "
+                f"'{model.name}': give it to the model, Model(outputs={{'{variable}': …}})"
+            )
+    y = ca.vertcat(*rows)
+    results = {"y": y, "C": ca.jacobian(y, z)}
+    return define("estimator_output", {"z": z}, results)
+
+
+def measured_outputs(
+    problem: Problem, sensors: Sequence[SensorTable], uncertain: Sequence[int] = ()
+) -> StackedFunction:
+    """What sensors read of the model: `y` (n_y,) and C = ∂y/∂z, by z.
+
+    Args:
+        problem: Has the model.
+        sensors: Name the states and outputs of the model.
+        uncertain: Places of the parameters that z has behind the states; the others are nominal.
+
+    Raises:
+        ModelError: A sensor reads what is neither a state nor an output.
+    """
+    return StackedFunction(_output(problem, sensors, uncertain))
+
+
+def by_direction(definition: Definition) -> Definition:
+    """Derivative `moved` of a function's stacked results along a direction Z (n,) of z.
+
+    Args:
+        definition: `transition` or `output` of a `FilterModel`.
+    """
+    symbols = {name: ca.SX.sym(name, size) for name, size in definition.inputs.items()}
+    stacked: ca.SX = definition.function(*symbols.values())
+    Z = ca.SX.sym("Z", symbols["z"].numel())
+    moved = ca.jtimes(stacked, symbols["z"], Z)
+    name = f"{definition.function.name()}_by_z"
+    return define(name, {**symbols, "Z": Z}, {"moved": moved})

@@ -354,7 +354,8 @@ class ExtendedKalmanFilter:
         """
         if self._engine is None:
             self._predict(a)
-            finite = bool(np.isfinite(self._states[0]).all())
+            covariance = self._covariance[: self._n, : self._n]
+            finite = bool(np.isfinite(self._states[0]).all() and np.isfinite(covariance).all())
         else:
             self._action[:] = a
             finite = self._engine.predict()

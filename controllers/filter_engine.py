@@ -52,7 +52,7 @@ class FilterEngine:
         return None if path is None else cls(str(path), memory, slopes)
 
     def predict(self) -> bool:
-        """Go on by a sample under the memory's action; whether the present z is finite."""
+        """Go on by a sample under the memory's action; whether what is predicted is finite."""
         return bool(self._predict(self._memory, self._slopes))
 
     def correct(self) -> bool:

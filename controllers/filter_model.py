@@ -32,6 +32,7 @@ class FilterModel:
     Attributes:
         transition: z₊ (`z_next`), A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u).
         output: What the sensors read, `y` (n_y,), and C = ∂y/∂z, by z.
+        variables: What each sensor reads, by name.
         delays: Samples from a reading of each sensor to its arrival.
         n_drifts: Number of uncertain parameters, the last entries of z.
         start: z before the first reading, (n,).
@@ -40,6 +41,7 @@ class FilterModel:
 
     transition: Definition
     output: Definition
+    variables: tuple[str, ...]
     delays: tuple[int, ...]
     n_drifts: int
     start: Vector
@@ -79,6 +81,7 @@ def filter_model(
     return FilterModel(
         transition=_transition(problem, uncertain),
         output=_output(problem, sensors, uncertain),
+        variables=tuple(sensor.variable for sensor in sensors),
         delays=tuple(sensor.delay for sensor in sensors),
         n_drifts=len(uncertain),
         start=np.concatenate([problem.reference_state, nominal]),

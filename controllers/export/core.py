@@ -41,22 +41,56 @@ STATUSES = (
 
 
 @dataclass(frozen=True)
-class Core:
-    """A controller in C: `sources` by file name, and the `parameters` θ that it starts from.
+class Observer:
+    """What makes a state of an exported controller's inputs.
 
-    `core.h` is what to include: it defines CoreState, core_reset, core_act, core_commit and
-    core_outputs, all static. `problem` is the one it was made for.
+    Attributes:
+        rule: The file that defines the type Observer and its functions in C.
+        sources: More files that it includes, by name.
+        memory: Numbers in the type Observer.
+        readings: Names of the variables that are read; none where the inputs are the state.
+        estimates: Number of outputs that it has behind the controller's own.
+    """
+
+    rule: str
+    sources: Mapping[str, bytes]
+    memory: int
+    readings: tuple[str, ...]
+    estimates: int
+
+
+def exact_state(problem: Problem) -> Observer:
+    """The state as it is measured, without an estimator.
+
+    Args:
+        problem: Has the number of states.
+    """
+    return Observer("state_measured.h", {}, problem.n_states, (), 0)
+
+
+@dataclass(frozen=True)
+class Core:
+    """A controller in C.
+
+    Attributes:
+        problem: The control problem that it was made for.
+        parameters: θ that it starts from.
+        sources: Files by name. `core.h` is what to include: it defines CoreState, core_reset,
+            core_act, core_commit and core_outputs, all static.
+        observer: What makes a state of its inputs.
     """
 
     problem: Problem
     parameters: Parameters
     sources: Mapping[str, bytes]
+    observer: Observer
 
 
 def core(
     problem: Problem,
     parameters: Parameters,
     hessian: str = "gauss-newton",
+    observer: Observer | None = None,
 ) -> Core:
     """Write the C of an RTI-NMPC: deterministic, without allocation, C99.
 
@@ -67,11 +101,14 @@ def core(
         problem: The control problem.
         parameters: θ at the start.
         hessian: `gauss-newton` or `exact`.
+        observer: What makes a state of the inputs; without one they are the state.
 
     Raises:
-        ControllerError: Another `hessian`, a horizon too long for a thread's stack, or a model that
-            calls what cannot be C.
+        ControllerError: Another `hessian`, a horizon too long for a thread's stack, readings so
+            late that the estimator's memory is, or a model that calls what cannot be C.
     """
+    if observer is None:
+        observer = exact_state(problem)
     parameters.require_well_posed()
     functions = SampleFunctions(problem, parameters.blocks, hessian)
     reason = why_not_in_c(functions)
@@ -91,32 +128,46 @@ def core(
             f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "
             f"than the {STACK_LIMIT / 1e3:.0f} kB that an exported controller may take; shorten it"
         )
-    return Core(problem, parameters, controller_sources(functions))
+    # An importer's copy of the state may be on the stack too.
+    memory = 8 * observer.memory
+    if memory > STACK_LIMIT:
+        raise ControllerError(
+            f"the latest of the readings needs {memory / 1e3:.0f} kB for the earlier states that "
+            f"the estimator keeps, more than the {STACK_LIMIT / 1e3:.0f} kB that an exported "
+            "controller may take: shorten its delay"
+        )
+    sources = controller_sources(functions, observer=observer)
+    return Core(problem, parameters, sources, observer)
 
 
 def controller_sources(
     functions: SampleFunctions,
     *,
     stagewise: bool = False,
+    observer: Observer | None = None,
 ) -> dict[str, bytes]:
     """C files of a controller.
 
     Args:
         functions: Its CasADi functions; those of `named` are in C.
         stagewise: Whether the QP is solved stage by stage; condensed else.
+        observer: What makes a state of the inputs; without one they are the state.
 
     Returns:
         Contents by file name, the same bytes for the same functions.
     """
+    if observer is None:
+        observer = exact_state(functions.problem)
     names = [
         "core.h",
         "rti.h",
+        observer.rule,
         *(STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER),
         "costs.h",
         "rotation.h",
         functions.hessian.source,
     ]
-    sources = {}
+    sources = dict(observer.sources)
     for name in names:
         sources[name] = (ENGINE_SOURCES / name).read_bytes()
     # The preparation's graph maps the stage's function and is written by hand; stage by stage
@@ -128,7 +179,7 @@ def controller_sources(
             called.append(part.function)
     sources["linearise.h"] = static_functions("linearise", [functions.stage])
     sources["functions.h"] = static_functions("functions", called)
-    sources["problem.h"] = _constants(functions, stagewise).encode()
+    sources["problem.h"] = _constants(functions, stagewise, observer.rule).encode()
     return sources
 
 
@@ -186,7 +237,7 @@ def static_functions(name: str, functions: Sequence[ca.Function]) -> bytes:
     return filled("functions.h.in", code=code).encode()
 
 
-def _constants(functions: SampleFunctions, stagewise: bool) -> str:
+def _constants(functions: SampleFunctions, stagewise: bool, observer: str) -> str:
     """Text of `problem.h`: sizes, the constants of problem and scale, and which files are used."""
     problem = functions.problem
     blocks = functions.blocks
@@ -255,6 +306,7 @@ def _constants(functions: SampleFunctions, stagewise: bool) -> str:
         residual=repr(SOLVED_RESIDUAL),
         cost_scale=repr(problem.scale.cost),
         rule=rule.source,
+        observer=observer,
         solver=(STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER)[0],
         signal_costs=str(int("SIGNAL" in functions.named)),
         **slack,
@@ -362,10 +414,11 @@ def plain_c(
         "states": ", ".join(scenario.plant.states),
         "actions": ", ".join(scenario.plant.actions),
         "parameters": core.parameters.blocks.size,
-        "memory": guess + solution + 2 * m + 2,
+        "memory": guess + solution + 2 * m + 2 + core.observer.memory,
         "statuses": ",\n".join(statuses),
         "theta": ", ".join(numbers),
         "core": _joined(core),
+        **_interface(core, upper),
     }
     names = {"controller.c": f"{name}.c", "controller.h": f"{name}.h"}
     files = {}
@@ -378,6 +431,68 @@ def plain_c(
         file_name = names.get(path.name, path.name)
         files[file_name] = text
     return files
+
+
+def _interface(core: Core, upper: str) -> dict[str, str]:
+    """Texts of the plain C on what is measured: the state, or readings that may be missing."""
+    names = core.observer.readings
+    if not names:
+        return {
+            "measured": f"const double state[{upper}_STATES]",
+            "arguments": "state",
+            "about": _ABOUT_STATE,
+            # In the C file.
+            "gather": "",
+            "gathered": "",
+            "inputs": "state",
+            "report": "",
+            # In the header.
+            "sizes": "",
+            "members": "",
+            # In the example.
+            "what": "states",
+            "note": "",
+            "given": "state",
+            "size": f"{upper}_STATES",
+            "fresh": "",
+            "mark": "",
+        }
+    readings = f"{upper}_READINGS"
+    estimate = "core->observer.corrected.z[0]"
+    return {
+        "measured": f"const double y[{readings}], const int fresh[{readings}]",
+        "arguments": "y, fresh",
+        "about": _ABOUT_READINGS,
+        "gather": _GATHER.replace("READINGS", readings),
+        "gathered": f"    double inputs[2 * {readings}];\n    gather(y, fresh, inputs);\n",
+        "inputs": "inputs",
+        "report": f"    memcpy(report->estimate, {estimate}, sizeof report->estimate);\n",
+        "sizes": f"    {readings} = {len(names)}, /* {', '.join(names)} */\n",
+        "members": f"    double estimate[{upper}_STATES]; /* of the present state */\n",
+        "what": "readings",
+        "note": _NOTE,
+        "given": "y",
+        "size": readings,
+        "fresh": f"    int fresh[{readings}];\n",
+        "mark": f"        for (int i = 0; i < {readings}; i++) fresh[i] = y[i] == y[i];\n",
+    }
+
+
+_ABOUT_STATE = """ for a measured state, within its bounds; returns the status. A state that is not
+ * finite is a failure like any other."""
+_ABOUT_READINGS = """, within its bounds, for the readings y. Those that are fresh and finite are
+ * taken up. Returns the status. Call it at each sample, without a fresh reading too: it predicts
+ * the state."""
+_GATHER = """static void gather(const double y[], const int fresh[], double inputs[]) {
+    for (int i = 0; i < READINGS; i++) {
+        inputs[i] = y[i];
+        inputs[READINGS + i] = fresh[i] != 0;
+    }
+}
+
+"""
+_NOTE = """ * A reading that has not come is nan:    printf '25 50\\nnan 51\\n' | ./example
+"""
 
 
 def _joined(core: Core) -> str:

@@ -2,17 +2,61 @@
 
 from __future__ import annotations
 
-from controllers.export.core import ENGINE_SOURCES, array_text, filled, static_functions
+from controllers.errors import ControllerError
+from controllers.export.core import (
+    ENGINE_SOURCES,
+    Observer,
+    array_text,
+    filled,
+    static_functions,
+)
 from controllers.filter_model import FilterModel, by_direction
-from controllers.functions import work_sizes
+from controllers.functions import not_in_c, work_sizes
+from cosim.core.protocols import Vector
 
 
-def filter_sources(model: FilterModel, *, differentiates: bool) -> dict[str, bytes]:
+def estimated_state(model: FilterModel, variances: Vector, *, in_theta: bool) -> Observer:
+    """The state of an exported controller as a filter estimates it.
+
+    Args:
+        model: What the filter computes with.
+        variances: Of its disturbances, drifts and sensors, (q,).
+        in_theta: Whether θ has them, in the block `noise`.
+
+    Raises:
+        ControllerError: The model calls what cannot be C.
+    """
+    reason = not_in_c([model.transition.function, model.output.function])
+    if reason is not None:
+        raise ControllerError(
+            f"the estimator cannot be exported: {reason}; write the model as expressions or as a "
+            "table (casadi.interpolant)"
+        )
+    n_all = model.n_kept * model.start.size
+    return Observer(
+        rule="state_estimated.h",
+        sources=filter_sources(model, variances=variances, in_theta=in_theta),
+        # Before a sample's readings and behind them.
+        memory=2 * (model.n_noises + n_all + n_all**2),
+        readings=model.variables,
+        estimates=model.start.size,
+    )
+
+
+def filter_sources(
+    model: FilterModel,
+    *,
+    differentiates: bool = False,
+    variances: Vector | None = None,
+    in_theta: bool = False,
+) -> dict[str, bytes]:
     """C files of a filter; `filter.h` is what to include.
 
     Args:
         model: What it computes with.
         differentiates: Whether its derivatives by its variances are among them.
+        variances: Those that it starts with, (q,); None where another says them.
+        in_theta: Whether θ says them at each sample.
 
     Returns:
         Contents by file name, the same bytes for the same model.
@@ -39,12 +83,15 @@ def filter_sources(model: FilterModel, *, differentiates: bool) -> dict[str, byt
             start += rows * columns
         sizes[f"{prefix}_SIZE"] = start
     arrays = {"FILTER_START": model.start, "FILTER_START_DEVIATION": model.start_deviation}
+    if variances is not None:
+        arrays["FILTER_VARIANCES"] = variances
     functions = [definition.function for definition in definitions.values()]
     header = filled(
         "filter_model.h.in",
         sizes="\n".join(f"    {name} = {value}," for name, value in sizes.items()),
         delays=", ".join(map(str, model.delays)),
         arrays="\n".join(array_text(name, values) for name, values in arrays.items()),
+        in_theta=str(int(in_theta)),
         functions=static_functions("filter", functions).decode(),
     )
     sources = {"filter_model.h": header.encode()}

@@ -9,15 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from controllers import Parameters, RtiNmpc
-from controllers.export import STATUSES, core, plain_c
+import numpy as np
+
+from controllers import ExtendedKalmanFilter, OutputFeedback, Parameters, Problem, RtiNmpc
+from controllers.export import STATUSES, Observer, core, estimated_state, plain_c
+from controllers.filter_model import measured_outputs
 from controllers.theta import ThetaBlocks
 from cosim.core.errors import ControllerLookupError
 from cosim.core.files import write_atomically
 from cosim.core.plugins import build_controller
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import EstimatorTable, Scenario
 from cosim.core.simulation import spawn_seeds
-from cosim.plant.fmi import unpack
+from cosim.plant.fmi import UnpackedFmu, unpack
 from cosim.plant.wiring import start_values
 from fmus.build import build_model, sampled_table
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
@@ -31,17 +34,19 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
 
     Raises ControllerLookupError where it is no RTI-NMPC, ModelError on a name that the model lacks.
     """
-    if scenario.sensors:
-        raise ControllerLookupError(
-            f"scenario '{scenario.name}' has sensors, and an estimator cannot be exported: export "
-            "the controller of the state, from the same scenario without [[sensor]]"
-        )
     if scenario.signals:
         raise ControllerLookupError(
             f"scenario '{scenario.name}' has signals, which an exported controller cannot take "
             "yet: export it from the same scenario without [[signal]]"
         )
-    controller: Any = build_controller(name, scenario)
+    if scenario.sensors and measured:
+        raise ControllerLookupError(
+            f"scenario '{scenario.name}' has sensors, whose estimator cannot be told a measured "
+            "disturbance yet: leave --measured out"
+        )
+    built: Any = build_controller(name, scenario)
+    # The estimator before it is exported beside it: `observer_of`.
+    controller = built.controller if isinstance(built, OutputFeedback) else built
     if type(controller) is not RtiNmpc or controller.iterations != 1:
         raise ControllerLookupError(
             f"controller '{name}' is no RTI-NMPC and cannot be exported; give "
@@ -62,6 +67,30 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
     return RtiNmpc(problem, controller.parameters.placed_in(naive))
 
 
+def observer_of(controller: RtiNmpc, scenario: Scenario) -> Observer | None:
+    """What makes the state of the readings of the scenario's sensors; None without sensors.
+
+    Args:
+        controller: Whose θ may have the filter's variances.
+        scenario: Says which estimator it is.
+
+    Raises:
+        ControllerLookupError: The estimator is another one than `ekf`.
+    """
+    if not scenario.sensors:
+        return None
+    kind = (scenario.estimator or EstimatorTable()).kind
+    if kind != "ekf":
+        raise ControllerLookupError(
+            f"scenario '{scenario.name}': an estimator of kind '{kind}' cannot be exported: take "
+            "estimator.kind 'ekf', or a scenario without [[sensor]]"
+        )
+    estimator = OutputFeedback.from_scenario(scenario, controller).estimator
+    assert isinstance(estimator, ExtendedKalmanFilter)
+    in_theta = "noise" in controller.parameters.blocks
+    return estimated_state(estimator.model, np.exp(estimator.noise), in_theta=in_theta)
+
+
 def sampled_controller(
     controller: RtiNmpc, scenario: Scenario, measured: tuple[str, ...] = ()
 ) -> FmuModel:
@@ -76,7 +105,8 @@ def sampled_controller(
     problem = controller.problem
     parameters = controller.parameters
     blocks = parameters.blocks
-    exported = core(problem, parameters, hessian)
+    observer = observer_of(controller, scenario)
+    exported = core(problem, parameters, hessian, observer)
     states = scenario.plant.states
     actions = scenario.plant.actions
     # Before anything is connected the controller sees its reference.
@@ -89,7 +119,10 @@ def sampled_controller(
         return Variable(name, kind, unit=unit, description=about, **more)
 
     # The order is that of the C's arrays: inputs, outputs, predictions, θ.
-    signals = [signal(Kind.INPUT, x, "measured state", x, start=start[x]) for x in states]
+    if observer is None:
+        signals = [signal(Kind.INPUT, x, "measured state", x, start=start[x]) for x in states]
+    else:
+        signals = _readings(scenario, problem, plant)
     about = "whether the actions are those of manual_…, as of the next sample"
     signals.append(
         Variable("manual", Kind.INPUT, Type.BOOLEAN, start=0.0, min=0.0, max=1.0, description=about)
@@ -117,6 +150,8 @@ def sampled_controller(
             for name in names:
                 about = f"predicted {name}, {k} samples ahead"
                 signals.append(signal(Kind.OUTPUT, f"predicted.{name}[{k}]", about, name))
+    if observer is not None:
+        signals += _estimates(scenario, problem, observer, plant)
     meanings = [block.meaning for block in blocks for _ in range(block.size)]
     signals += [
         Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
@@ -135,15 +170,73 @@ def sampled_controller(
         step_size=scenario.sampling_time,
         sampled=True,
         sources=exported.sources,
-        terminal=(*states, *actions),
+        # The terminal is that of a plant whose states are measured as they are.
+        terminal=(*states, *actions) if observer is None else (),
     )
+
+
+def _readings(scenario: Scenario, problem: Problem, plant: UnpackedFmu) -> list[Variable]:
+    """The readings, and whether each of them is fresh.
+
+    Scalars in FMI 3.0 too: an array has one unit for all of its elements.
+    """
+    sensors = scenario.sensors or ()
+    output = measured_outputs(problem, sensors)
+    output.inputs["z"][:] = problem.reference_state
+    output()
+    values = output.part("y").tolist()
+    readings = []
+    fresh = []
+    for sensor, value in zip(sensors, values, strict=True):
+        name = f"y_{sensor.variable}"
+        about = f"reading of {sensor.variable}"
+        if sensor.delay:
+            about += f", taken {sensor.delay} samples ago"
+        unit = plant.unit(sensor.variable)
+        readings.append(Variable(name, Kind.INPUT, unit=unit, start=value, description=about))
+        about = f"whether {name} is a new reading, to be taken up at the present sample"
+        fresh.append(
+            Variable(
+                f"{name}_fresh",
+                Kind.INPUT,
+                Type.BOOLEAN,
+                start=0.0,
+                min=0.0,
+                max=1.0,
+                description=about,
+            )
+        )
+    return [*readings, *fresh]
+
+
+def _estimates(
+    scenario: Scenario, problem: Problem, observer: Observer, plant: UnpackedFmu
+) -> list[Variable]:
+    """The estimates of the state, and of the parameters that the model calls uncertain."""
+    states = scenario.plant.states
+    outputs = []
+    for name in states:
+        about = f"estimate of {name} at the present sample"
+        unit = plant.unit(name)
+        outputs.append(Variable(f"estimated.{name}", Kind.OUTPUT, unit=unit, description=about))
+    for name in problem.model.uncertain[: observer.estimates - len(states)]:
+        about = f"estimate of the model's parameter {name}"
+        outputs.append(Variable(f"estimated.{name}", Kind.OUTPUT, description=about))
+    return outputs
 
 
 def write_c(
     controller: RtiNmpc, scenario: Scenario, folder: Path, single: bool = False
 ) -> dict[str, Any]:
     """Write the controller as C into `folder`, whose name its functions begin with."""
-    exported = core(controller.problem, controller.parameters, scenario.controller.hessian)
+    observer = observer_of(controller, scenario)
+    if single and observer is not None:
+        raise ControllerLookupError(
+            f"scenario '{scenario.name}' has sensors, and single precision does not carry the "
+            "covariance of their estimator: leave --single out"
+        )
+    hessian = scenario.controller.hessian
+    exported = core(controller.problem, controller.parameters, hessian, observer)
     # A folder's name may hold what no C identifier does.
     name = re.sub(r"\W", "_", folder.absolute().name)
     files = plain_c(exported, name, scenario, single=single)

@@ -63,6 +63,11 @@ def export(
         # In the SSP the plant is what measures them; elsewhere the user connects them.
         if ssp is not None and missing:
             raise CosimError(f"--ssp: the plant has no disturbance {', '.join(sorted(missing))}")
+        if ssp is not None and loaded.sensors:
+            raise CosimError(
+                f"--ssp: scenario '{loaded.name}' has sensors, whose noise and delays no FMU has: "
+                "leave --ssp out"
+            )
         rti = controller_fmu.rti_controller(controller, loaded, names)
         if format_ == "c":
             if ssp is not None:

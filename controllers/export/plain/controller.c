@@ -24,22 +24,20 @@ void ${name}_init($Name *controller) {
     core_reset((CoreState *)controller->memory);
 }
 
-static int sample($Name *controller, const double state[], const double manual[], double action[]) {
+static int sample($Name *controller, const double inputs[], const double manual[], double action[]) {
     CoreState *const core = (CoreState *)controller->memory;
-    core_act(core, state, manual, controller->theta);
+    core_act(core, inputs, manual, controller->theta);
     core_commit(core);
     memcpy(action, core->applied, sizeof core->applied);
     return (int)core->status;
 }
 
-int ${name}_step($Name *controller, const double state[${NAME}_STATES],
-          double action[${NAME}_ACTIONS]) {
-    return sample(controller, state, 0, action);
+${gather}int ${name}_step($Name *controller, $measured, double action[${NAME}_ACTIONS]) {
+${gathered}    return sample(controller, $inputs, 0, action);
 }
 
-int ${name}_manual($Name *controller, const double state[${NAME}_STATES],
-          double action[${NAME}_ACTIONS]) {
-    return sample(controller, state, action, action);
+int ${name}_manual($Name *controller, $measured, double action[${NAME}_ACTIONS]) {
+${gathered}    return sample(controller, $inputs, action, action);
 }
 
 const char *${name}_message(int status) {
@@ -53,4 +51,4 @@ void ${name}_report(const $Name *controller, ${Name}Report *report) {
     report->kkt_residual = core->solution.residual;
     report->iterations = (int)core->solution.iterations;
     report->failures = core->failures;
-}
+$report}

@@ -6,7 +6,7 @@
  *     static $Name controller;
  *     ${name}_init(&controller);
  *     every $sampling_time s:
- *         status = ${name}_step(&controller, measured, action);
+ *         status = ${name}_step(&controller, $arguments, action);
  */
 #ifndef ${NAME}_H
 #define ${NAME}_H
@@ -19,7 +19,7 @@ extern "C" {
 
 enum {
     ${NAME}_STATES = $n,  /* $states */
-    ${NAME}_ACTIONS = $m, /* $actions */
+$sizes    ${NAME}_ACTIONS = $m, /* $actions */
     ${NAME}_THETA = $parameters,
     ${NAME}_MEMORY = $memory
 };
@@ -40,18 +40,17 @@ typedef struct {
     double kkt_residual; /* the largest, of the last QP that was solved */
     int iterations;      /* of the QP solver, in that QP */
     double failures;     /* samples that held the last action, so far */
-} ${Name}Report;
+$members} ${Name}Report;
 
 /* The trained theta, the reference action, no memory of earlier samples. */
 void ${name}_init($Name *controller);
 
-/* The action for a measured state, within its bounds; returns the status. A state that is not
- * finite is a failure like any other. */
-int ${name}_step($Name *controller, const double state[${NAME}_STATES], double action[${NAME}_ACTIONS]);
+/* The action$about */
+int ${name}_step($Name *controller, $measured, double action[${NAME}_ACTIONS]);
 
 /* In manual, in the place of ${name}_step: `action` is the operator's and comes back within its bounds,
  * whatever the status. The controller follows it, so that the next ${name}_step goes on from there. */
-int ${name}_manual($Name *controller, const double state[${NAME}_STATES], double action[${NAME}_ACTIONS]);
+int ${name}_manual($Name *controller, $measured, double action[${NAME}_ACTIONS]);
 
 /* A status in words. */
 const char *${name}_message(int status);

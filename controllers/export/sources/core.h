@@ -1,4 +1,4 @@
-/* The controller as a sampled system: state in, action out, once a sample.
+/* The controller as a sampled system: what is measured in, action out, once a sample.
  *
  * `core_act` computes the outputs of the present sample and may be called again when the state or the
  * manual action changes; `core_commit` ends the sample. A sample without a solution repeats the last
@@ -21,6 +21,9 @@
 
 #include "rti.h"
 
+/* What makes a state of the inputs: measured as it is, or estimated. */
+#include OBSERVER_RULE
+
 /* Where a QP is linearised. */
 typedef struct {
     double x[HORIZON][N_X], u[HORIZON][N_U], costates[HORIZON][N_X];
@@ -36,6 +39,7 @@ typedef struct {
 typedef struct {
     CoreGuess guess;
     CoreSolution solution; /* of the last sample that was solved */
+    Observer observer;
     double action[N_U];    /* of the present sample */
     double applied[N_U];   /* of the last one */
     double failures; /* among the samples before the present one */
@@ -105,14 +109,16 @@ static int core_sample(const CoreGuess *guess, const double theta[], const doubl
 static void core_reset(CoreState *state) {
     memset(state, 0, sizeof *state);
     core_forget(&state->guess);
+    observer_reset(&state->observer);
     memcpy(state->applied, REFERENCE_ACTION, sizeof state->applied);
     memcpy(state->action, REFERENCE_ACTION, sizeof state->action);
 }
 
-/* `manual` is the operator's action, which acts within its bounds whatever the status is, or null in
+/* `inputs` are the observer's; `manual` is the operator's action, which acts within its bounds whatever the status is, or null in
  * automatic. An entry that is not finite holds the last one. */
-static void core_act(CoreState *state, const double s[], const double manual[],
+static void core_act(CoreState *state, const double inputs[], const double manual[],
                      const double theta[]) {
+    const double *const s = observer_take(&state->observer, inputs, theta);
     double a[N_U];
     for (int i = 0; i < N_U; i++)
         a[i] = manual && isfinite(manual[i]) ? qp_clip(manual[i], ACTION_LOWER[i], ACTION_UPPER[i])
@@ -123,20 +129,21 @@ static void core_act(CoreState *state, const double s[], const double manual[],
     memcpy(state->action, a, sizeof a);
 }
 
-/* The n inputs of the table of variables: the state, whether the action is manual, the manual action,
+/* The n inputs of the table of variables: the observer's, whether the action is manual, the manual action,
  * and what is measured, for the last entries of theta; one that is not finite leaves theta's own. */
 static inline void core_evaluate(CoreState *state, const double inputs[], int n,
                                  const double theta[]) {
-    const double *const manual = inputs + N_X + 1;
+    const double *const manual = inputs + OBSERVER_INPUTS + 1;
     double present[N_THETA];
     memcpy(present, theta, sizeof present);
-    for (int i = N_X + 1 + N_U; i < n; i++)
+    for (int i = OBSERVER_INPUTS + 1 + N_U; i < n; i++)
         if (isfinite(inputs[i])) present[N_THETA - n + i] = inputs[i];
-    core_act(state, inputs, inputs[N_X] != 0.0 ? manual : 0, present);
+    core_act(state, inputs, inputs[OBSERVER_INPUTS] != 0.0 ? manual : 0, present);
 }
 
 static void core_commit(CoreState *state) {
     memcpy(state->applied, state->action, sizeof state->applied);
+    observer_commit(&state->observer, state->applied);
     if (state->status == RTI_SOLVED) {
         state->guess = state->solution.next;
         return;
@@ -150,12 +157,12 @@ static inline int core_plausible(const CoreState *state) {
     return all_finite(&state->guess.x[0][0], sizeof state->guess / sizeof(double)) &&
            all_finite(&state->solution.x[0][0], sizeof state->solution / sizeof(double)) &&
            all_finite(state->action, N_U) && all_finite(state->applied, N_U) &&
-           state->failures >= 0.0 && state->failures < 9e15 && state->status >= 0 &&
-           state->status <= RTI_INACCURATE;
+           observer_plausible(&state->observer) && state->failures >= 0.0 &&
+           state->failures < 9e15 && state->status >= 0 && state->status <= RTI_INACCURATE;
 }
 
 /* Outputs in the order of the table of variables: action, value, status, residual, iterations,
- * failures, predicted states by stage, predicted actions by stage. */
+ * failures, predicted states by stage, predicted actions by stage, the observer's. */
 static inline void core_outputs(const CoreState *state, double y[]) {
     const CoreSolution *solution = &state->solution;
     for (int i = 0; i < N_U; i++) *y++ = state->action[i];
@@ -166,6 +173,7 @@ static inline void core_outputs(const CoreState *state, double y[]) {
     *y++ = state->failures + (state->status != RTI_SOLVED);
     memcpy(y, solution->x, sizeof solution->x);
     memcpy(y + (HORIZON + 1) * N_X, solution->u, sizeof solution->u);
+    observer_outputs(&state->observer, y + (HORIZON + 1) * N_X + HORIZON * N_U);
 }
 
 #endif

@@ -52,6 +52,16 @@ static inline void filter_reset(Filter *filter) {
         filter->covariance[i][i] = FILTER_START_DEVIATION[i] * FILTER_START_DEVIATION[i];
 }
 
+/* Whether the present z and its covariance are finite, through which all else comes. */
+static inline int filter_finite(const Filter *filter) {
+    double sum = 0.0;
+    for (int i = 0; i < FILTER_Z; i++) {
+        sum += fabs(filter->z[0][i]);
+        for (int j = 0; j < FILTER_Z; j++) sum += fabs(filter->covariance[i][j]);
+    }
+    return isfinite(sum);
+}
+
 static void filter_step(const Filter *filter, const double u[], FilterStep *step) {
     const double *arguments[TRANSITION_ARG] = {filter->z[0], u};
     double *results[TRANSITION_RES] = {step->stack}, w[TRANSITION_W + 1];
@@ -62,8 +72,8 @@ static void filter_step(const Filter *filter, const double u[], FilterStep *step
 /* Every z moves back by one sample, the oldest is forgotten. `across` is the covariance of z₊ with
  * all z before, `present` that of z₊ itself. */
 static void filter_shift(double covariance[FILTER_ALL][FILTER_ALL],
-                         const double across[FILTER_Z][FILTER_ALL],
-                         const double present[FILTER_Z][FILTER_Z]) {
+                         double across[FILTER_Z][FILTER_ALL],
+                         double present[FILTER_Z][FILTER_Z]) {
     enum { KEPT = FILTER_ALL - FILTER_Z };
     for (int i = FILTER_ALL - 1; i >= FILTER_Z; i--)
         memmove(covariance[i] + FILTER_Z, covariance[i - FILTER_Z], KEPT * sizeof(double));

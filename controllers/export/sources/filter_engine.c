@@ -17,15 +17,13 @@ size_t filter_sizes(int what) {
     return what == 0 ? sizeof(FilterMemory) : sizeof(FilterSlopes);
 }
 
-/* Go on by a sample under `action`; whether the present z is finite. `slopes` may be null. */
+/* Go on by a sample under `action`; whether what is predicted is finite. `slopes` may be null. */
 int filter_predict(FilterMemory *memory, FilterSlopes *slopes) {
     FilterStep step;
     filter_step(&memory->filter, memory->action, &step);
     if (slopes) filter_slopes_move(slopes, &memory->filter, memory->action, &step);
     filter_move(&memory->filter, &step);
-    double sum = 0.0;
-    for (int i = 0; i < FILTER_Z; i++) sum += fabs(memory->filter.z[0][i]);
-    return isfinite(sum);
+    return filter_finite(&memory->filter);
 }
 
 /* Take up the readings `y`, NaN where there is none; 0, and nothing is done, where one is infinite. */

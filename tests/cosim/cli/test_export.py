@@ -31,6 +31,7 @@ from tests.helpers.instance import Instance
 pytestmark = needs_compiler
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SAMPLES = 60
+ASSAY = ["naive", "-s", "assay", "--out", "c.fmu"]
 ACTION = 1e-9
 
 
@@ -282,6 +283,9 @@ def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
         (["nothing.toml", "--out", "c.fmu"], "nothing.toml' does not exist"),
         (["naive", "--out", "c.fmu", "--measured", "UA2"], "has not all of UA2 to measure"),
         (["naive", "--out", "no/such/folder/c.fmu", "--local"], "no/such/folder"),
+        ([*ASSAY, "--measured", "X1"], "leave --measured out"),
+        ([*ASSAY, "--format", "c", "--single"], "leave --single out"),
+        ([*ASSAY, "--ssp", "loop.ssp"], "leave --ssp out"),
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(

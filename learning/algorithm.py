@@ -13,7 +13,7 @@ from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from cosim.core.modules import load_plugin
 from cosim.core.plugins import ALGORITHMS, registered
 from cosim.core.protocols import Vector
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import Penalty, Scenario
 from cosim.core.validation import suggestion
 from learning.checkpoint import State
 from learning.configuration import Configuration
@@ -41,6 +41,8 @@ class Transition(NamedTuple):
         next_solution: for V(s₊) and π(s₊).
         point, next_point: linearisation points at s and s₊, None unless the rule `needs_points`.
         y: what the sensors showed at s, (n_y,), NaN where nothing came; None without sensors.
+        moved_penalty: penalty of the bounds as they are at s₊; None where no signal moves them.
+        signal_cost: what known prices alone change of ℓ + V(s₊) − Q(s, a), at the reference.
     """
 
     number: int
@@ -57,6 +59,8 @@ class Transition(NamedTuple):
     point: LinearisationPoint | None
     next_point: LinearisationPoint | None
     y: Vector | None = None
+    moved_penalty: Penalty | None = None
+    signal_cost: float = 0.0
 
 
 class Update(NamedTuple):
@@ -103,6 +107,9 @@ class Algorithm:
     - `needs_points`: whether it reads the linearisation points.
     - `learns_from_estimates`: whether it may run where the scenario has sensors. `s` and
       `next_s` of a transition are then estimates, its penalties expectations.
+    - `learns_under_signals`: whether it may run where the scenario has signals. Solutions are then
+      those of the signals as they are known at their samples. A rule that solves a past sample
+      again must not: the controller knows the present signals alone.
 
     Optional, looked up by name:
 
@@ -135,6 +142,7 @@ class Algorithm:
     needs_q_solution = False
     needs_points = False
     learns_from_estimates = False
+    learns_under_signals = False
 
     def __init__(
         self,

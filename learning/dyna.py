@@ -45,6 +45,7 @@ class Dyna(QLearning):
     """
 
     learns_from_estimates = False
+    learns_under_signals = False
 
     Configuration: ClassVar[type[QLearningConfiguration]] = DynaConfiguration
     configuration: DynaConfiguration

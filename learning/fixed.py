@@ -12,6 +12,7 @@ class Fixed(Algorithm):
     """θ stays at its start."""
 
     learns_from_estimates = True
+    learns_under_signals = True
 
     Configuration: ClassVar[type[Configuration]] = GreedyConfiguration
     explores = False

@@ -14,7 +14,8 @@ from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.core.loop import ClosedLoop
 from cosim.core.protocols import Plant, Step, Vector
-from cosim.core.scenario import Scenario
+from cosim.core.scenario import Penalty, Scenario
+from cosim.core.signals import signals_of
 from cosim.plant import FmuPlant
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
@@ -22,6 +23,7 @@ from learning.errors import PrivilegeError
 from learning.exploration import Strategy
 from learning.gaussian_penalty import normal_penalties
 from learning.retreat import Retreat
+from learning.signal_costs import SignalCosts
 from learning.step import update_without_fit
 
 FLAGS_EVERY = 10
@@ -101,8 +103,18 @@ class TrainingLoop:
             self._simulator = plant
             in_operation = plant
         # What runs in the loop; `controller`, behind the estimator if there is one, carries θ.
-        self._law = measured(scenario, controller)
-        self._loop = ClosedLoop(in_operation.step, self._law, scenario, keeps_points=True)
+        self.law = measured(scenario, controller)
+        self.signals = signals_of(scenario)
+        self._signal_costs = SignalCosts(controller.problem)
+        # What known prices change of the present sample's cost, and of V.
+        self._signal_changes = (0.0, 0.0)
+        self._loop = ClosedLoop(
+            in_operation.step,
+            self.law,
+            scenario,
+            keeps_points=True,
+            known=None if self.signals is None else self.signals.known,
+        )
         self.controller = controller
         self.algorithm = algorithm
         self.rng = rng
@@ -111,7 +123,7 @@ class TrainingLoop:
         self._retreat = retreat
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
-        self._penalty = scenario.state_penalty
+        self._still_penalty = scenario.state_penalty
         self.counts = Counts()
 
     def start(self, s: Vector, y: Vector | None = None) -> None:
@@ -134,19 +146,26 @@ class TrainingLoop:
         """What a rule may know of the present state, (n,): under sensors the estimate."""
         if self._loop.y is None:
             return self._loop.s
-        estimate: Vector = self._law.estimate  # type: ignore[attr-defined]
+        estimate: Vector = self.law.estimate  # type: ignore[attr-defined]
         return estimate
+
+    @property
+    def penalty(self) -> Penalty:
+        """That of the bounds as they are at the present sample."""
+        if self.signals is None:
+            return self._still_penalty
+        return self.signals.penalty(self._loop.number)
 
     @property
     def known_penalty(self) -> float:
         """What a rule may know of the present state's penalty: under sensors its expectation."""
         s = self.known_state
-        estimator = getattr(self._law, "estimator", None)
+        estimator = getattr(self.law, "estimator", None)
         covariance = getattr(estimator, "covariance", None)
         if self._loop.y is None or covariance is None:
-            return self._penalty(s.tolist())
+            return self.penalty(s.tolist())
         variances = covariance.diagonal()
-        return float(normal_penalties(self._penalty, s[None], variances[None]).sum())
+        return float(normal_penalties(self.penalty, s[None], variances[None]).sum())
 
     @property
     def parameters(self) -> Parameters:
@@ -260,10 +279,14 @@ class TrainingLoop:
             self.counts.licq_failed += not solution.licq
         sample = loop.step(a)
         self.counts.number = number + 1
+        stage_change, value_change = self._signal_changes
         # The solution at s₊ serves the next sample too.
         self._solve()
         next_solution: RtiSolution | None = loop.solution
+        next_value_change = self._signal_changes[1]
         step = sample.step
+        if self.signals is not None:
+            self.signals.check_foreseen(step.disturbance[None], number)
         cost = step.stage_cost + step.penalty
         if solution is None or q_solution is None or next_solution is None:
             return None, cost
@@ -288,8 +311,16 @@ class TrainingLoop:
             point=point if needs_points else None,
             next_point=loop.point if needs_points else None,
             y=sample.y,
+            moved_penalty=self._moved_penalty(),
+            signal_cost=stage_change + next_value_change - value_change,
         )
         return transition, cost
+
+    def _moved_penalty(self) -> Penalty | None:
+        """The present penalty where signals move the bounds; None else."""
+        if self.signals is None or not self.signals.move_bounds:
+            return None
+        return self.penalty
 
     def _choose(self, solution: RtiSolution | None) -> tuple[Vector, bool]:
         """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
@@ -320,6 +351,9 @@ class TrainingLoop:
 
     def _solve(self, *, prepare: bool = True) -> None:
         """Solve for V(s) and π(s) of the present state; a failure is counted."""
+        if self.signals is not None:
+            known = self.signals.known(self._loop.number)
+            self._signal_changes = self._signal_costs.of_sample(known)
         self.counts.failures += not self._loop.solve(prepare=prepare)
 
     def restart(self) -> None:
@@ -328,6 +362,7 @@ class TrainingLoop:
         Done at each checkpoint and on resuming, so that both runs have the same digits.
         """
         self.controller.reset()
+        self._loop.inform()
         # A failed sample has left no linearisation point.
         if self._loop.point is None:
             # Not by the law, whose estimator has predicted this sample already.
@@ -351,7 +386,7 @@ class TrainingLoop:
             state |= prefixed("point", self._loop.point._asdict())
         if self._loop.y is not None:
             state["y"] = self._loop.y
-            law: Any = self._law
+            law: Any = self.law
             state |= prefixed("estimator", law.state_dict())
         state |= prefixed("counts", asdict(self.counts))
         if self._retreat is not None:
@@ -368,9 +403,11 @@ class TrainingLoop:
         self._loop.point = LinearisationPoint(**point) if point else None
         if "y" in state:
             self._loop.y = state["y"]
-            law: Any = self._law
+            law: Any = self.law
             law.load_state_dict(part_of(state, "estimator"))
         self.counts = Counts(**part_of(state, "counts"))
+        # Signals are those of a sample's number.
+        self._loop.number = self.counts.number
         if self._retreat is not None:
             self._retreat.load_state_dict(part_of(state, "retreat"))
         self.algorithm.load_state_dict(part_of(state, "algorithm"))

@@ -259,12 +259,18 @@ class PredictionErrors:
         self._errors[:, oldest] = error
         self.count += 1
 
-    def expected_penalty(self, prediction: Vector) -> float:
-        """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""
+    def expected_penalty(self, prediction: Vector, moved: Penalty | None = None) -> float:
+        """mean_i p(f + e_i); NaN before the first error.
+
+        Args:
+            prediction: f, (n,).
+            moved: penalty of the bounds where they have moved; None: the scenario's.
+        """
         values = self.values
         if not len(values):
             return float("nan")
-        due = known_penalty(self._penalty, prediction + values)
+        penalty = self._penalty if moved is None else moved
+        due = known_penalty(penalty, prediction + values)
         return float(due.mean())
 
     def state_dict(self) -> State:

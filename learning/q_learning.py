@@ -368,6 +368,7 @@ class QLearning(ValueRule):
     """
 
     learns_from_estimates = True
+    learns_under_signals = True
 
     Configuration = QLearningConfiguration
     needs_q_solution = True
@@ -392,10 +393,12 @@ class QLearning(ValueRule):
         # First the error, so that the expectation has at least one.
         self._errors.add(error)
         # The realised penalty of s₊ is replaced by its expectation.
-        expected = self._errors.expected_penalty(prediction)
+        expected = self._errors.expected_penalty(prediction, transition.moved_penalty)
         next_value = transition.next_solution.value - transition.next_penalty + expected
         solution = transition.q_solution
-        target = self._average_cost.target(transition.cost, next_value)
+        # What the hour's prices cost whatever is done teaches nothing.
+        cost = transition.cost - transition.signal_cost
+        target = self._average_cost.target(cost, next_value)
         td_error = target - solution.value
         mean_cost = self._average_cost.mean_cost
         self._average_cost.follow(td_error)

@@ -447,7 +447,7 @@ def run_training(
         FmuPlant(run.scenario) as evaluation_plant,
     ):
         session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
-        compile_functions(session.loop.controller, run.samples)
+        compile_functions(session.loop.law, run.samples)
         if resume:
             session.load()
         else:
@@ -471,7 +471,7 @@ def run_training(
             baselines=evaluator.baselines,
             predicted_cost=float(getattr(session.loop.algorithm, "predicted_cost", nan)),
             changes=getattr(session.loop.algorithm, "changes", None),
-            functions=functions_of(session.loop.controller),
+            functions=functions_of(session.loop.law),
             without_checkpoint=session.without_checkpoint,
             wall_seconds=time.perf_counter() - clock,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from math import gcd, isfinite
+from math import gcd, isclose, isfinite, lcm
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -209,8 +209,10 @@ def _with_held_out_runs(
     """
     if options.evaluation_steps is not None:
         return options
+    # A part of a day says nothing of what the day costs.
+    longest = _whole(EVALUATION_STEPS, _period(scenario) or 1)
     if scenario.plant.fmu in SHIPPED_FMUS or not options.evaluation_seeds:
-        return replace(options, evaluation_steps=EVALUATION_STEPS)
+        return replace(options, evaluation_steps=longest)
     assert options.evaluate_every is not None
     # Of θ after so many samples; at the end, of the start, of naive, and of the optimum if known.
     evaluations = (samples - 1) // options.evaluate_every + 4
@@ -218,8 +220,8 @@ def _with_held_out_runs(
     held_out_samples = samples // HELD_OUT_SHARE
     steps = held_out_samples // n_runs
     if steps < SHORTEST:
-        return replace(options, evaluation_seeds=0, evaluation_steps=EVALUATION_STEPS)
-    return replace(options, evaluation_steps=min(steps, EVALUATION_STEPS))
+        return replace(options, evaluation_seeds=0, evaluation_steps=longest)
+    return replace(options, evaluation_steps=min(steps, longest))
 
 
 def _fitting_log_interval(evaluate_every: int | None, checkpoint_every: int | None) -> int:
@@ -292,10 +294,11 @@ def begin_training(
         algorithm: class of its rule.
         plant: of its scenario.
     """
-    if run.scenario.signals:
+    if run.scenario.signals and not getattr(algorithm, "learns_under_signals", False):
         raise ConfigurationError(
-            f"scenario '{run.scenario.name}' has signals, which no rule can learn with yet: train "
-            "on the same scenario without [[signal]], and simulate or evaluate the θ on this one"
+            f"scenario '{run.scenario.name}' has signals, which {run.algorithm} cannot learn with "
+            "yet: use q-learning or fixed, or train on the same scenario without [[signal]] and "
+            "simulate or evaluate the θ on this one"
         )
     if run.scenario.sensors and not getattr(algorithm, "learns_from_estimates", False):
         raise ConfigurationError(
@@ -331,6 +334,10 @@ def begin_training(
         algorithm_rng,
         _retreat(run, rule, controller.theta),
     )
+    if loop.signals is not None:
+        # The state after the last sample is solved for, too.
+        loop.signals.require(run.samples + 1)
+        loop.signals.foresee(plant, plant_seed, run.samples + 1)
     # A rule on a simulator says where its first episode begins.
     first_episode = getattr(rule, "first_episode", None)
     if first_episode is None:
@@ -351,8 +358,42 @@ def _retreat(
     tries = rule.requires == "simulator" or hasattr(rule, "theta")
     if tries or not configuration.retreat_probability:
         return None
-    shift = round(3600.0 * configuration.shift_hours / run.scenario.sampling_time)
+    shift = _shift_samples(configuration.shift_hours, run.scenario)
+    if shift is None:
+        return None
     return Retreat(start, shift, configuration.retreat_probability)
+
+
+def _shift_samples(hours: float, scenario: Scenario) -> int | None:
+    """Samples of a shift, whose cost is compared with that of others; None where none can be.
+
+    Under signals these are whole periods, so that no hour's price stands for what θ costs.
+
+    Args:
+        hours: of a shift at least.
+        scenario: has the sampling time, and perhaps signals.
+    """
+    shift = round(3600.0 * hours / scenario.sampling_time)
+    period = _period(scenario)
+    return None if period is None else _whole(shift, period)
+
+
+def _whole(samples: int, period: int) -> int:
+    """The least multiple of a period from so many samples on."""
+    return -(-samples // period) * period
+
+
+def _period(scenario: Scenario) -> int | None:
+    """Samples after which all signals begin again, 1 without any; None where there is none."""
+    period = 1
+    for signal in scenario.valued_signals:
+        if signal.period is None:
+            return None
+        samples = round(signal.period / scenario.sampling_time)
+        if not isclose(samples * scenario.sampling_time, signal.period, rel_tol=1e-9):
+            return None
+        period = lcm(period, samples)
+    return period
 
 
 def starting_parameters(

@@ -135,6 +135,11 @@ class ClosedLoop:
             return self.s
         return self.y
 
+    def inform(self) -> None:
+        """Tell the controller what is known of the scenario's signals at the present sample."""
+        if self._known is not None and self._inform is not None:
+            self._inform(self._known(self.number))
+
     def solve(self, *, prepare: bool = True) -> bool:
         """Prepare, and feed the present state back, into `solution`.
 
@@ -151,8 +156,7 @@ class ClosedLoop:
         # The two phases are timed apart: only feedback delays the action.
         try:
             if prepare:
-                if self._known is not None and self._inform is not None:
-                    self._inform(self._known(self.number))
+                self.inform()
                 self._controller.prepare()
                 # Now: a feedback of several QPs linearises elsewhere.
                 if self._keeps_points:

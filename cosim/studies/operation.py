@@ -117,7 +117,6 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
     # What a sample costs after a divergence.
     cost = np.full(run.samples, np.inf)
     violating = np.ones(run.samples, dtype=bool)
-    penalty = run.scenario.state_penalty
     rows: list[LogRow] = []
     processor_seconds: dict[int, float] = {}
     status = "finished"
@@ -128,12 +127,12 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
         before = _cost_of_the_start(run, plant)
         loop = begin_training(run, load_algorithm(run.algorithm), plant)
         clock = process_time()
-        compile_functions(loop.controller, run.samples)
+        compile_functions(loop.law, run.samples)
         start_theta = loop.controller.theta.copy()
         for k in range(run.samples):
             n_samples = k + 1
             if status == "finished":
-                violation = float(penalty.violation(loop.s).sum())
+                violation = float(loop.penalty.violation(loop.s).sum())
                 violating[k] = violation > VIOLATING
                 try:
                     cost[k], update = loop.advance()
@@ -167,8 +166,8 @@ def run_in_operation(run: TrainingRun, marks: Sequence[int]) -> OperationRun:
 def _cost_of_the_start(run: TrainingRun, plant: FmuPlant) -> Array:
     """Cost (K,) of each sample of a run if θ stayed as it starts."""
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
-    compile_functions(controller, run.samples)
     law = measured(run.scenario, controller)
+    compile_functions(law, run.samples)
     signals = simulate(plant, law, run.samples, run.seed, residuals=False).signals
     return signals["stage_cost"].values + signals["penalty"].values
 

@@ -1,0 +1,63 @@
+"""What prices that move change of costs and values by themselves, whatever a controller does.
+
+A price's change by the hour moves the cost of every sample, and at N samples ahead that of the
+predicted ones: a learning rule would take this for an error of V. At the reference it is known.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from controllers.functions import StackedFunction, define
+from controllers.problem import Problem
+from controllers.varying import of_kind
+from cosim.core.signals import Known
+
+
+class SignalCosts:
+    """What known prices change of the economic cost at the reference.
+
+    Args:
+        problem: Has the prices among its varying quantities, or none.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        model = problem.model
+        self._prices = [item for _, item in of_kind(problem.varying, "price")]
+        self._discounts = problem.discounts[:-1].tolist()
+        prices = ca.SX.sym("prices", len(self._prices))
+        parameters = ca.SX(ca.DM(model.nominal_parameters))
+        for row, item in enumerate(self._prices):
+            parameters[item.place] = prices[row]
+        x = ca.SX(ca.DM(problem.reference_state))
+        u = ca.SX(ca.DM(problem.reference_action))
+        d = ca.SX(ca.DM(model.nominal_disturbance))
+        still = ca.SX(ca.DM(model.nominal_parameters))
+        change = model.economic_cost(x, u, d, parameters) - model.economic_cost(x, u, d, still)
+        self._change = StackedFunction(define("change", {"prices": prices}, {"change": change}))
+        self._changes: dict[tuple[float, ...], float] = {}
+
+    def of_sample(self, known: Known) -> tuple[float, float]:
+        """The change of the stage cost of a sample, and that of V: of all stages of its QP.
+
+        Args:
+            known: What is known at the sample, by the signals' names.
+        """
+        if not self._prices:
+            return 0.0, 0.0
+        columns = [known[item.signal].tolist() for item in self._prices]
+        stages = []
+        for k in range(len(self._discounts)):
+            # Beyond the last known value the NMPC holds it.
+            prices = tuple(column[min(k, len(column) - 1)] for column in columns)
+            stages.append(self._change_at(prices))
+        value = sum(d * change for d, change in zip(self._discounts, stages, strict=True))
+        return stages[0], value
+
+    def _change_at(self, prices: tuple[float, ...]) -> float:
+        """The change of a stage's cost at some prices."""
+        if prices not in self._changes:
+            self._change.inputs["prices"][:] = prices
+            self._change()
+            self._changes[prices] = float(self._change.stack[0])
+        return self._changes[prices]

@@ -49,6 +49,8 @@ class Rollout:
         parameters: Parameters,
         features: Features,
     ) -> None:
+        # A rollout's controller is told nothing at its samples.
+        assert not problem.varying, "a rollout knows no signals"
         self._problem = problem
         self._features = features
         self._controller = RtiNmpc(problem, parameters)

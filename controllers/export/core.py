@@ -78,12 +78,14 @@ class Core:
         sources: Files by name. `core.h` is what to include: it defines CoreState, core_reset,
             core_act, core_commit and core_outputs, all static.
         observer: What makes a state of its inputs.
+        known_counts: Number of known values of each signal, in the order of `problem.varying`.
     """
 
     problem: Problem
     parameters: Parameters
     sources: Mapping[str, bytes]
     observer: Observer
+    known_counts: tuple[int, ...]
 
 
 def core(
@@ -91,6 +93,7 @@ def core(
     parameters: Parameters,
     hessian: str = "gauss-newton",
     observer: Observer | None = None,
+    known_counts: Sequence[int] = (),
 ) -> Core:
     """Write the C of an RTI-NMPC: deterministic, without allocation, C99.
 
@@ -102,11 +105,14 @@ def core(
         parameters: θ at the start.
         hessian: `gauss-newton` or `exact`.
         observer: What makes a state of the inputs; without one they are the state.
+        known_counts: How many values of each of the problem's varying quantities are known at a
+            sample, the present one first.
 
     Raises:
         ControllerError: Another `hessian`, a horizon too long for a thread's stack, readings so
             late that the estimator's memory is, or a model that calls what cannot be C.
     """
+    assert len(known_counts) == len(problem.varying), "one for each varying quantity"
     if observer is None:
         observer = exact_state(problem)
     parameters.require_well_posed()
@@ -116,11 +122,6 @@ def core(
         raise ControllerError(
             f"a controller with the model '{problem.model.name}' cannot be exported: {reason}; "
             "write it as expressions or as a table (casadi.interpolant)"
-        )
-    if problem.varying:
-        raise ControllerError(
-            "a problem whose signals are known along the horizon cannot be exported yet: export "
-            "the controller of the same scenario without [[signal]]"
         )
     size = stack_needed(functions)
     if size > STACK_LIMIT:
@@ -136,8 +137,8 @@ def core(
             f"the estimator keeps, more than the {STACK_LIMIT / 1e3:.0f} kB that an exported "
             "controller may take: shorten its delay"
         )
-    sources = controller_sources(functions, observer=observer)
-    return Core(problem, parameters, sources, observer)
+    sources = controller_sources(functions, observer=observer, known_counts=known_counts)
+    return Core(problem, parameters, sources, observer, tuple(known_counts))
 
 
 def controller_sources(
@@ -145,6 +146,7 @@ def controller_sources(
     *,
     stagewise: bool = False,
     observer: Observer | None = None,
+    known_counts: Sequence[int] = (),
 ) -> dict[str, bytes]:
     """C files of a controller.
 
@@ -152,6 +154,7 @@ def controller_sources(
         functions: Its CasADi functions; those of `named` are in C.
         stagewise: Whether the QP is solved stage by stage; condensed else.
         observer: What makes a state of the inputs; without one they are the state.
+        known_counts: Number of known values of each signal, where they are inputs.
 
     Returns:
         Contents by file name, the same bytes for the same functions.
@@ -179,7 +182,8 @@ def controller_sources(
             called.append(part.function)
     sources["linearise.h"] = static_functions("linearise", [functions.stage])
     sources["functions.h"] = static_functions("functions", called)
-    sources["problem.h"] = _constants(functions, stagewise, observer.rule).encode()
+    constants = _constants(functions, stagewise, observer.rule, known_counts)
+    sources["problem.h"] = constants.encode()
     return sources
 
 
@@ -237,7 +241,12 @@ def static_functions(name: str, functions: Sequence[ca.Function]) -> bytes:
     return filled("functions.h.in", code=code).encode()
 
 
-def _constants(functions: SampleFunctions, stagewise: bool, observer: str) -> str:
+def _constants(
+    functions: SampleFunctions,
+    stagewise: bool,
+    observer: str,
+    known_counts: Sequence[int],
+) -> str:
     """Text of `problem.h`: sizes, the constants of problem and scale, and which files are used."""
     problem = functions.problem
     blocks = functions.blocks
@@ -251,6 +260,7 @@ def _constants(functions: SampleFunctions, stagewise: bool, observer: str) -> st
         "N_THETA": blocks.size,
         "N_VARYING": len(problem.varying),
         "N_GIVEN": given_size(problem, blocks),
+        "N_KNOWN": sum(known_counts),
     }
     for prefix, call in functions.named.items():
         for name, place in call.slices.items():
@@ -307,6 +317,8 @@ def _constants(functions: SampleFunctions, stagewise: bool, observer: str) -> st
         cost_scale=repr(problem.scale.cost),
         rule=rule.source,
         observer=observer,
+        # Where they are no inputs nobody reads this; an array has one entry at least.
+        known=", ".join(map(str, known_counts or [1] * max(len(problem.varying), 1))),
         solver=(STAGEWISE_SOLVER if stagewise else CONDENSED_SOLVER)[0],
         signal_costs=str(int("SIGNAL" in functions.named)),
         **slack,
@@ -419,6 +431,7 @@ def plain_c(
         "theta": ", ".join(numbers),
         "core": _joined(core),
         **_interface(core, upper),
+        **_known_interface(core, upper),
     }
     names = {"controller.c": f"{name}.c", "controller.h": f"{name}.h"}
     files = {}
@@ -431,6 +444,32 @@ def plain_c(
         file_name = names.get(path.name, path.name)
         files[file_name] = text
     return files
+
+
+def _known_interface(core: Core, upper: str) -> dict[str, str]:
+    """Texts of the plain C on what is known of signals."""
+    if not core.known_counts:
+        return {
+            "known": "0",
+            "known_argument": "",
+            "known_value": "",
+            "known_size": "",
+            "known_declaration": "",
+            "known_read": "",
+        }
+    known = f"{upper}_KNOWN"
+    parts = []
+    for item, count in zip(core.problem.varying, core.known_counts, strict=True):
+        parts.append(f"{item.signal} now" + (f" and {count - 1} ahead" if count > 1 else ""))
+    return {
+        "known": "known",
+        "known_argument": f", const double known[{known}]",
+        "known_value": ", known",
+        "known_size": f"    {known} = {sum(core.known_counts)}, /* {'; '.join(parts)} */\n",
+        "known_declaration": f"    double known[{known}];\n",
+        "known_read": f"        for (int i = 0; i < {known}; i++)\n"
+        '            if (scanf("%lf", &known[i]) != 1) return 0;\n',
+    }
 
 
 def _interface(core: Core, upper: str) -> dict[str, str]:

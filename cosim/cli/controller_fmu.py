@@ -19,6 +19,7 @@ from cosim.core.errors import ControllerLookupError
 from cosim.core.files import write_atomically
 from cosim.core.plugins import build_controller
 from cosim.core.scenario import EstimatorTable, Scenario
+from cosim.core.signals import ahead_of
 from cosim.core.simulation import spawn_seeds
 from cosim.plant.fmi import UnpackedFmu, unpack
 from cosim.plant.wiring import start_values
@@ -34,11 +35,6 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
 
     Raises ControllerLookupError where it is no RTI-NMPC, ModelError on a name that the model lacks.
     """
-    if scenario.signals:
-        raise ControllerLookupError(
-            f"scenario '{scenario.name}' has signals, which an exported controller cannot take "
-            "yet: export it from the same scenario without [[signal]]"
-        )
     if scenario.sensors and measured:
         raise ControllerLookupError(
             f"scenario '{scenario.name}' has sensors, whose estimator cannot be told a measured "
@@ -106,7 +102,7 @@ def sampled_controller(
     parameters = controller.parameters
     blocks = parameters.blocks
     observer = observer_of(controller, scenario)
-    exported = core(problem, parameters, hessian, observer)
+    exported = core(problem, parameters, hessian, observer, known_counts(scenario))
     states = scenario.plant.states
     actions = scenario.plant.actions
     # Before anything is connected the controller sees its reference.
@@ -123,6 +119,7 @@ def sampled_controller(
         signals = [signal(Kind.INPUT, x, "measured state", x, start=start[x]) for x in states]
     else:
         signals = _readings(scenario, problem, plant)
+    signals += _known(scenario, problem, plant)
     about = "whether the actions are those of manual_…, as of the next sample"
     signals.append(
         Variable("manual", Kind.INPUT, Type.BOOLEAN, start=0.0, min=0.0, max=1.0, description=about)
@@ -173,6 +170,32 @@ def sampled_controller(
         # The terminal is that of a plant whose states are measured as they are.
         terminal=(*states, *actions) if observer is None else (),
     )
+
+
+def known_counts(scenario: Scenario) -> tuple[int, ...]:
+    """How many values of each known signal a controller is given at a sample."""
+    counts = []
+    for signal in scenario.signals or ():
+        if signal.known != "none":
+            counts.append(1 + ahead_of(signal, scenario))
+    return tuple(counts)
+
+
+def _known(scenario: Scenario, problem: Problem, plant: UnpackedFmu) -> list[Variable]:
+    """What is known of each signal: its present value or, of a preview, an array of them."""
+    tables = {table.name: table for table in scenario.signals or ()}
+    inputs = []
+    for item, count in zip(problem.varying, known_counts(scenario), strict=True):
+        table = tables[item.signal]
+        variable = table.bounded_state if table.bound is not None else table.reference
+        unit = plant.unit(variable) if variable else ""
+        for k in range(count):
+            name = f"signal.{item.signal}" + (f"[{k}]" if count > 1 else "")
+            about = f"known value of {item.signal}, {k} samples ahead"
+            inputs.append(
+                Variable(name, Kind.INPUT, unit=unit, start=item.nominal, description=about)
+            )
+    return inputs
 
 
 def _readings(scenario: Scenario, problem: Problem, plant: UnpackedFmu) -> list[Variable]:
@@ -236,7 +259,9 @@ def write_c(
             "covariance of their estimator: leave --single out"
         )
     hessian = scenario.controller.hessian
-    exported = core(controller.problem, controller.parameters, hessian, observer)
+    exported = core(
+        controller.problem, controller.parameters, hessian, observer, known_counts(scenario)
+    )
     # A folder's name may hold what no C identifier does.
     name = re.sub(r"\W", "_", folder.absolute().name)
     files = plain_c(exported, name, scenario, single=single)

@@ -68,6 +68,11 @@ def export(
                 f"--ssp: scenario '{loaded.name}' has sensors, whose noise and delays no FMU has: "
                 "leave --ssp out"
             )
+        if ssp is not None and loaded.signals:
+            raise CosimError(
+                f"--ssp: scenario '{loaded.name}' has signals, which no FMU of the loop gives: "
+                "leave --ssp out"
+            )
         rti = controller_fmu.rti_controller(controller, loaded, names)
         if format_ == "c":
             if ssp is not None:

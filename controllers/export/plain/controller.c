@@ -24,20 +24,23 @@ void ${name}_init($Name *controller) {
     core_reset((CoreState *)controller->memory);
 }
 
-static int sample($Name *controller, const double inputs[], const double manual[], double action[]) {
+static int sample($Name *controller, const double inputs[], const double known[],
+                  const double manual[], double action[]) {
     CoreState *const core = (CoreState *)controller->memory;
-    core_act(core, inputs, manual, controller->theta);
+    double given[N_GIVEN];
+    core_given(controller->theta, known, given);
+    core_act(core, inputs, manual, given);
     core_commit(core);
     memcpy(action, core->applied, sizeof core->applied);
     return (int)core->status;
 }
 
-${gather}int ${name}_step($Name *controller, $measured, double action[${NAME}_ACTIONS]) {
-${gathered}    return sample(controller, $inputs, 0, action);
+${gather}int ${name}_step($Name *controller, $measured$known_argument, double action[${NAME}_ACTIONS]) {
+${gathered}    return sample(controller, $inputs, $known, 0, action);
 }
 
-int ${name}_manual($Name *controller, $measured, double action[${NAME}_ACTIONS]) {
-${gathered}    return sample(controller, $inputs, action, action);
+int ${name}_manual($Name *controller, $measured$known_argument, double action[${NAME}_ACTIONS]) {
+${gathered}    return sample(controller, $inputs, $known, action, action);
 }
 
 const char *${name}_message(int status) {

@@ -6,7 +6,7 @@
  *     static $Name controller;
  *     ${name}_init(&controller);
  *     every $sampling_time s:
- *         status = ${name}_step(&controller, $arguments, action);
+ *         status = ${name}_step(&controller, $arguments$known_value, action);
  */
 #ifndef ${NAME}_H
 #define ${NAME}_H
@@ -19,7 +19,7 @@ extern "C" {
 
 enum {
     ${NAME}_STATES = $n,  /* $states */
-$sizes    ${NAME}_ACTIONS = $m, /* $actions */
+$sizes$known_size    ${NAME}_ACTIONS = $m, /* $actions */
     ${NAME}_THETA = $parameters,
     ${NAME}_MEMORY = $memory
 };
@@ -46,11 +46,11 @@ $members} ${Name}Report;
 void ${name}_init($Name *controller);
 
 /* The action$about */
-int ${name}_step($Name *controller, $measured, double action[${NAME}_ACTIONS]);
+int ${name}_step($Name *controller, $measured$known_argument, double action[${NAME}_ACTIONS]);
 
 /* In manual, in the place of ${name}_step: `action` is the operator's and comes back within its bounds,
  * whatever the status. The controller follows it, so that the next ${name}_step goes on from there. */
-int ${name}_manual($Name *controller, $measured, double action[${NAME}_ACTIONS]);
+int ${name}_manual($Name *controller, $measured$known_argument, double action[${NAME}_ACTIONS]);
 
 /* A status in words. */
 const char *${name}_message(int status);

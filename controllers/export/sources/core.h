@@ -83,6 +83,7 @@ static int core_sample(const CoreGuess *guess, const double theta[], const doubl
     QP_SCRATCH RtiPrepared prepared;
     QP_SCRATCH RtiSolved solved;
     if (!well_posed(theta)) return RTI_ILL_POSED;
+    if (!all_finite(theta + N_THETA, N_GIVEN - N_THETA)) return QP_NOT_FINITE;
     memcpy(prepared.x, guess->x, sizeof prepared.x);
     memcpy(prepared.u, guess->u, sizeof prepared.u);
     memcpy(prepared.costates, guess->costates, sizeof prepared.costates);
@@ -114,7 +115,7 @@ static void core_reset(CoreState *state) {
     memcpy(state->action, REFERENCE_ACTION, sizeof state->action);
 }
 
-/* `inputs` are the observer's; `manual` is the operator's action, which acts within its bounds whatever the status is, or null in
+/* `inputs` are the observer's, `theta` is (θ, σ); `manual` is the operator's action, which acts within its bounds whatever the status is, or null in
  * automatic. An entry that is not finite holds the last one. */
 static void core_act(CoreState *state, const double inputs[], const double manual[],
                      const double theta[]) {
@@ -129,16 +130,29 @@ static void core_act(CoreState *state, const double inputs[], const double manua
     memcpy(state->action, a, sizeof a);
 }
 
-/* The n inputs of the table of variables: the observer's, whether the action is manual, the manual action,
- * and what is measured, for the last entries of theta; one that is not finite leaves theta's own. */
+/* (θ, σ) of θ and what is known of the signals: of each its present value and those ahead, as many as
+ * KNOWN_COUNTS says. Beyond its last known value a signal keeps that. */
+static inline void core_given(const double theta[], const double known[], double given[]) {
+    memcpy(given, theta, N_THETA * sizeof *given);
+    for (int row = 0; row < N_VARYING; row++) {
+        const int last = KNOWN_COUNTS[row] - 1;
+        for (int k = 0; k <= HORIZON; k++)
+            given[N_THETA + k * N_VARYING + row] = known[k < last ? k : last];
+        known += KNOWN_COUNTS[row];
+    }
+}
+
+/* The n inputs of the table of variables: the observer's, what is known of signals, whether the action
+ * is manual, the manual action, and what is measured, for the last entries of theta; one that is not
+ * finite leaves theta's own. */
 static inline void core_evaluate(CoreState *state, const double inputs[], int n,
                                  const double theta[]) {
-    const double *const manual = inputs + OBSERVER_INPUTS + 1;
-    double present[N_THETA];
-    memcpy(present, theta, sizeof present);
-    for (int i = OBSERVER_INPUTS + 1 + N_U; i < n; i++)
-        if (isfinite(inputs[i])) present[N_THETA - n + i] = inputs[i];
-    core_act(state, inputs, inputs[OBSERVER_INPUTS] != 0.0 ? manual : 0, present);
+    const double *const known = inputs + OBSERVER_INPUTS, *const manual = known + N_KNOWN + 1;
+    double given[N_GIVEN];
+    core_given(theta, known, given);
+    for (int i = OBSERVER_INPUTS + N_KNOWN + 1 + N_U; i < n; i++)
+        if (isfinite(inputs[i])) given[N_THETA - n + i] = inputs[i];
+    core_act(state, inputs, known[N_KNOWN] != 0.0 ? manual : 0, given);
 }
 
 static void core_commit(CoreState *state) {

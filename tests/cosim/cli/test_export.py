@@ -285,7 +285,8 @@ def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
         (["naive", "--out", "no/such/folder/c.fmu", "--local"], "no/such/folder"),
         ([*ASSAY, "--measured", "X1"], "leave --measured out"),
         ([*ASSAY, "--format", "c", "--single"], "leave --single out"),
-        ([*ASSAY, "--ssp", "loop.ssp"], "leave --ssp out"),
+        ([*ASSAY, "--ssp", "loop.ssp"], "has sensors, whose noise and delays no FMU has"),
+        (["naive", "-s", "prices", "--out", "c.fmu", "--ssp", "l.ssp"], "which no FMU of the loop"),
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(

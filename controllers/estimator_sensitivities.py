@@ -99,7 +99,7 @@ class FilterSensitivities:
         by_noise = _evaluated(self._transition_by_z, step, self.states[:, 0])
         # CasADi has columns one after the other.
         A_by_noise = by_noise[:, step.slices["A"]].reshape(-1, n, n).swapaxes(1, 2)
-        G_by_noise = by_noise[:, step.slices["G"]].reshape(-1, self._n_disturbances, n)
+        G_by_noise = by_noise[:, step.slices["G"]].reshape(self.size, self._n_disturbances, n)
         G_by_noise = G_by_noise.swapaxes(1, 2)
 
         # As in the filter: the present block, what lies between it and earlier ones, and the rest.

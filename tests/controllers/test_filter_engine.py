@@ -1,5 +1,7 @@
 """The compiled filter against the interpreted one, and what becomes of it without a compiler."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,8 @@ from controllers.errors import ControllerError, ModelWarning
 from controllers.factories import naive
 from controllers.filter_engine import FilterEngine
 from cosim import Scenario
+from cosim.core.scenario import SensorTable
+from tests.controllers.test_estimator import linear_model, linear_problem
 from tests.helpers.compiler import needs_compiler
 
 SAMPLES = 500
@@ -148,3 +152,41 @@ def test_without_a_compiler_it_stays_interpreted(monkeypatch):
     estimator.compile()
     assert estimator.functions == "interpreted"
     estimator.predict(Scenario.load("assay").reference_action)
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("n_disturbances", [0, 2])
+@pytest.mark.parametrize(
+    "sensors",
+    [
+        [{"variable": "a", "deviation": 0.3}],
+        [
+            {"variable": "sum", "deviation": 0.3, "delay": 4},
+            {"variable": "b", "deviation": 0.1, "delay": 1},
+            {"variable": "a", "delay": 2},
+        ],
+    ],
+)
+def test_models_without_drifts_or_disturbances_too(n_disturbances, sensors):
+    model = linear_model()
+    if n_disturbances == 0:
+        model = replace(model, disturbances=(), ode=lambda x, u, d, p: -0.02 * x + u[0])
+    filters = []
+    for _ in range(2):
+        tables = [SensorTable(**sensor) for sensor in sensors]
+        made = ExtendedKalmanFilter(linear_problem(model), tables, differentiates=True)
+        filters.append(made)
+    filters[0].compile()
+    assert filters[0].functions == "compiled"
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        y = rng.normal(0.0, 2.0, len(sensors))
+        y[rng.random(len(sensors)) < 0.4] = np.nan
+        a = rng.normal(size=1)
+        for each in filters:
+            each.correct(y)
+            each.predict(a)
+    one, other = (each.state_dict() for each in filters)
+    for name, array in other.items():
+        assert np.abs(one[name] - array).max() < 1e-12 * max(np.abs(array).max(), 1.0), name

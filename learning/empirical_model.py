@@ -350,7 +350,8 @@ class Standardisation(NamedTuple):
 class _Regression:
     """The regression of outputs (M, K) on inputs (M, n+m), linear about parameters c.
 
-    A fit takes every `step`-th sample, and with each the one before where errors persist.
+    A fit takes every `step`-th sample, and with each the one before where errors persist; a sample
+    that does not follow the one before it (`follows`) is then left out.
     """
 
     def __init__(
@@ -359,11 +360,15 @@ class _Regression:
         inputs: Array,
         outputs: Array,
         settings: EmpiricalModelConfiguration,
+        follows: NDArray[np.bool_] | None = None,
     ) -> None:
         self._features = features
         self._inputs = inputs
         self._outputs = outputs
         self._settings = settings
+        if follows is None:
+            follows = np.arange(len(inputs)) > 0
+        self._follows = follows
         unit = inputs.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
         self.standardisation = Standardisation(inputs.mean(axis=0), unit)
@@ -385,9 +390,10 @@ class _Regression:
         design, target = self._linearised(c, rows)
         if persistence.any():
             # What persists of the error before is no news (Cochrane and Orcutt 1949).
-            design_before, target_before = self._linearised(c, rows[1:] - 1)
-            design = design[1:] - persistence @ design_before
-            target = target[1:] - target_before @ persistence.T
+            follows = self._follows[rows]
+            design_before, target_before = self._linearised(c, rows[follows] - 1)
+            design = design[follows] - persistence @ design_before
+            target = target[follows] - target_before @ persistence.T
         return design, target
 
     def residuals(
@@ -407,10 +413,12 @@ class _Regression:
         """
         rows = self._samples(step)
         errors = self._errors(mean, rows)
+        follows = self._follows[rows]
+        rows_before = rows[follows] - 1
         # Of consecutive samples the errors before are at hand.
-        before = errors[:-1] if step == 1 else self._errors(mean, rows[1:] - 1)
+        before = errors[rows_before] if step == 1 else self._errors(mean, rows_before)
         persistence = estimate_persistence(
-            errors[1:],
+            errors[follows],
             before,
             earlier_persistence,
             n_earlier,
@@ -418,7 +426,7 @@ class _Regression:
             largest=self._settings.largest_persistence,
         )
         if persistence.any():
-            errors = errors[1:] - before @ persistence.T
+            errors = errors[follows] - before @ persistence.T
         return errors - errors.mean(axis=0), persistence
 
     def _samples(self, step: int) -> Rows:
@@ -476,8 +484,9 @@ class EmpiricalModel:
         outputs: Array,
         settings: EmpiricalModelConfiguration,
         earlier: EmpiricalModel | None = None,
+        follows: NDArray[np.bool_] | None = None,
     ) -> EmpiricalModel:
-        """Estimate from consecutive transitions.
+        """Estimate from transitions.
 
         Args:
             features: the nominal model.
@@ -486,6 +495,8 @@ class EmpiricalModel:
             settings: prior and rounds.
             earlier: an earlier estimate, whose residuals are kept beside the new ones, and whose Φ
                 counts as if they had been seen here.
+            follows: whether each transition begins where the one before ends, (M,); all but the
+                first if not given.
         """
         p = features.n_parameters
         K = features.n_outputs
@@ -494,7 +505,7 @@ class EmpiricalModel:
         if earlier is not None:
             earlier_residuals = earlier.residuals
             earlier_persistence = earlier.persistence
-        regression = _Regression(features, inputs, outputs, settings)
+        regression = _Regression(features, inputs, outputs, settings, follows)
         largest_error = settings.largest_parameter_error
 
         # All fits but the last take every `thinning`-th sample.

@@ -22,20 +22,23 @@ from learning.q_learning import QLearning
 from learning.step import ConstrainedStep, td_step
 
 if TYPE_CHECKING:
+    from learning.from_data import TrainingFromData, train_from_data
     from learning.training import Tracker, Training, train
     from learning.training_run import TrainingRun
 
 __all__ = [
     "ActorCritic", "Algorithm", "AlgorithmLookupError", "BatchQLearning", "CheckpointError",
     "Configuration", "ConfigurationError", "ConstrainedStep", "DivergenceError", "LearningError",
-    "PrivilegeError", "QLearning", "Strategy", "Tracker", "Training", "TrainingRun", "Transition",
-    "Update", "algorithms", "part_of", "prefixed", "td_step", "train",
+    "PrivilegeError", "QLearning", "Strategy", "Tracker", "Training", "TrainingFromData",
+    "TrainingRun", "Transition", "Update", "algorithms", "part_of", "prefixed", "td_step", "train",
+    "train_from_data",
 ]  # fmt: skip
 
 # Imported on first use: half a second that a rule does not need.
 __getattr__, _, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "from_data": ["TrainingFromData", "train_from_data"],
         "training": ["Tracker", "Training", "train"],
         "training_run": ["TrainingRun"],
     },

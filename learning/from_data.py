@@ -106,8 +106,8 @@ class TrainingFromData(Shown):
         against_logged: J of the learned θ less that of the logged operation.
         against_start: J of the learned θ less that of the start.
         start_against_logged: J of the start less that of the logged operation.
-        model_share: share of the variance of `against_start` that comes from what the log does not
-            say of the plant; the rest is the chance of its disturbances.
+        model_share: share of the variance that comes from what the log does not say of the plant,
+            of the difference that is shown least; the rest is the chance of its disturbances.
         parameters_known: of each parameter and nominal disturbance of the model.
         directions_shown: number of the directions of these that the log shows.
         excitation: of each action, the part of its standard deviation that does not follow from
@@ -176,8 +176,8 @@ class TrainingFromData(Shown):
         return (
             f"the log does not show the plant well enough: {name} moved by itself by "
             f"{100 * self.excitation[name]:.2g} % of its range only. Steps of "
-            f"±{0.05 * (upper - lower):.3g} on top of the controller, each held for some samples, for "
-            f"a day, would show it; else {longer}"
+            f"±{0.05 * (upper - lower):.3g} on top of the controller, each held for some samples, "
+            f"for a day, would show it; else {longer}"
         )
 
     def _facts(self) -> dict[str, object]:
@@ -265,7 +265,10 @@ def train_from_data(
     if not isinstance(scenario, Scenario):
         scenario = Scenario.load(scenario)
     options = TrainingOptions(
-        seed=seed, start=str(start), controller=controller, evaluation_seeds=0
+        seed=seed,
+        start=str(start),
+        controller=controller,
+        evaluation_seeds=0,
     )
     run = make_run(algorithm, scenario, 1, settings, options)
     _check_run(run)
@@ -334,8 +337,11 @@ def _train(run: TrainingRun, problem: Problem, data: LoggedData) -> TrainingFrom
     of_learned = draws.costs[0]
     of_start = draws.costs[1]
     realised = outputs[:, -1] + run.scenario.state_penalty.along(data.states)
-    against_start, model_share = difference(of_learned, of_start)
-    against_logged, _ = difference(of_learned, draws.logged)
+    against_start, share_against_start = difference(of_learned, of_start)
+    against_logged, share_against_logged = difference(of_learned, draws.logged)
+    model_share = share_against_start
+    if _upper_end(against_logged) > _upper_end(against_start):
+        model_share = share_against_logged
     start_against_logged, _ = difference(of_start, draws.logged)
     known, directions_shown = _known_parameters(problem, model, settings)
     return TrainingFromData(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import cosim
+from cosim.cli import logged_data
 from cosim.cli import output as cli
 from cosim.core.errors import CosimError
 from cosim.core.training_options import TrainingOptions, option_ranges, with_training_options
@@ -32,6 +33,9 @@ def train(
     algorithm: Annotated[str, typer.Option("--algorithm", "-a")],
     scenario: cli.ScenarioOption = "paper",
     samples: Annotated[int | None, cli.count("--samples", "-n")] = None,
+    data: logged_data.DataOption = None,
+    columns: logged_data.ColumnsOption = None,
+    leave_out: logged_data.LeaveOutOption = None,
     out: cli.OutOption = Path("cosim-train"),
     resume: Annotated[bool, typer.Option("--resume")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
@@ -46,6 +50,9 @@ def train(
 
     The learned θ is compared with the start on the same held-out noise. Exit code 1: it is worse,
     and parameters.toml holds the start; or learning diverged, and the summary says why.
+
+    With --data θ is learned from logged data, and no plant is stepped: the answer is the predicted
+    difference of J, with its interval, and θ is the start where the log cannot tell.
 
     Args:
         algorithm: A registered one or module:Class.
@@ -71,6 +78,22 @@ def train(
         if explain:
             _explain(algorithm, rule.Configuration.documentation(), out_)
             return
+        if data is not None:
+            of_a_plant = {"samples": samples, "resume": resume, "gif": gif, "record": record}
+            logged_data.refuse(of_a_plant, "has no part in a training from --data")
+            logged_data.train_from_data(
+                algorithm,
+                data,
+                scenario,
+                rule.Configuration.from_assignments(assignments or []),
+                TrainingOptions(**options),
+                columns,
+                leave_out,
+                out,
+                out_,
+            )
+            return
+        logged_data.refuse({"column": columns, "leave-out": leave_out}, "belongs to --data")
         run = make_run(
             algorithm,
             cosim.Scenario.load(scenario),

@@ -180,10 +180,22 @@ def read_log(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     leave_out: Sequence[str] = (),
+    given: Sequence[str] | None = None,
 ) -> LogTable:
-    """Read the rows of a log; arguments and errors are those of `read_logged_data`."""
+    """Read the rows of a log; other arguments and errors are those of `read_logged_data`.
+
+    Args:
+        path: of the CSV file.
+        scenario: names the variables.
+        columns: the file's name of a column by ours.
+        units: of the variables.
+        leave_out: `COLUMN=VALUE` each.
+        given: what is read in place of the states: signals of sensors, `measured[X2]` say.
+    """
     file = _File(path)
-    states = scenario.plant.states
+    states = tuple(given or scenario.plant.states)
+    # Our own runs write NaN where a sensor has nothing new.
+    missing = ("", "nan") if states != scenario.plant.states else ("",)
     actions = scenario.plant.actions
     names = (TIME, *states, *actions, STAGE_COST)
     wanted = dict(columns or {})
@@ -194,7 +206,7 @@ def read_log(
             )
     known_units = units or {}
 
-    def column(name: str) -> Array:
+    def column(name: str, missing: Sequence[str] = ("",)) -> Array:
         position = file.position(wanted.get(name, name), name)
         stated = file.units[position]
         expected = known_units.get(name, "")
@@ -203,7 +215,7 @@ def read_log(
                 f"'{path}': column '{file.titles[position]}' is in {stated}, and {name} in "
                 f"{expected}: convert it, or head it [{expected}] where that is the same"
             )
-        return file.numbers(position)
+        return file.numbers(position, missing)
 
     time = _seconds(file, file.position(wanted.get(TIME, TIME), TIME))
     has_cost = STAGE_COST in wanted or STAGE_COST in file.names
@@ -211,7 +223,7 @@ def read_log(
         path=str(path),
         lines=np.arange(2, 2 + len(file.rows)),
         time=time,
-        states=np.column_stack([column(name) for name in states]),
+        states=np.column_stack([column(name, missing) for name in states]),
         actions=np.column_stack([column(name) for name in actions]),
         stage_cost=column(STAGE_COST) if has_cost else None,
         excluded=_excluded(file, leave_out),
@@ -229,7 +241,7 @@ def transitions_of(table: LogTable, scenario: Scenario) -> LoggedData:
     Raises:
         LoggedDataError: the whole log is doubtful.
     """
-    _check_sampling_time(table, scenario)
+    check_sampling_time(table, scenario)
     _check_sizes(table, scenario)
     states_missing = _in_any_column(np.isnan(table.states))
     others = [table.actions]
@@ -340,7 +352,7 @@ def _beyond(actions: Array, scenario: Scenario) -> Flags:
     return below | above
 
 
-def _check_sampling_time(table: LogTable, scenario: Scenario) -> None:
+def check_sampling_time(table: LogTable, scenario: Scenario) -> None:
     """Refuse a log of another sampling time than the scenario's."""
     if len(table.time) < 2:
         raise LoggedDataError(f"'{table.path}' has {len(table.time)} rows, and two are needed")
@@ -480,11 +492,16 @@ class _File:
         """The cells of a column."""
         return [row[position].strip() for row in self.rows]
 
-    def numbers(self, position: int) -> Array:
-        """The numbers of a column, NaN where a cell is empty; refuses what is no finite number."""
+    def numbers(self, position: int, missing: Sequence[str] = ("",)) -> Array:
+        """The numbers of a column, NaN where one is missing; refuses what is no finite number.
+
+        Args:
+            position: number of the column.
+            missing: texts of a cell without a value.
+        """
         values = np.full(len(self.rows), np.nan)
         for number, text in enumerate(self.texts(position)):
-            if text:
+            if text not in missing:
                 values[number] = self._number(text, number, position)
         return values
 

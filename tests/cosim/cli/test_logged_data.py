@@ -1,0 +1,54 @@
+"""`cosim shadow` and `cosim train --data`: their files, their refusals, their exit codes."""
+
+import json
+
+import pytest
+
+from cosim import FmuPlant, build_controller, simulate
+
+
+@pytest.fixture(scope="module")
+def log(paper, tmp_path_factory):
+    """The log of a PI controller."""
+    with FmuPlant(paper) as plant:
+        run = simulate(plant, build_controller("pi", paper), 150, 0)
+    return run.write_csv(tmp_path_factory.mktemp("log") / "log.csv")
+
+
+def test_shadow_writes_its_files_and_the_same_bytes_again(cosim, log, tmp_path):
+    words = ("shadow", "tuned", "--data", log, "--json")
+    code, out, _ = cosim(*words, "--out", "one")
+    assert code == 0
+    summary = json.loads(out)
+    assert summary == json.loads((tmp_path / "one/summary.json").read_text())
+    assert summary["samples"] == 150
+    cosim(*words, "--out", "two")
+    for name in ("shadow.csv", "shadow.png", "summary.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    header = (tmp_path / "one/shadow.csv").read_text().splitlines()[0]
+    assert header == "time [s],X2,P2,P100,proposed[P100],F200,proposed[F200],status"
+
+
+TRAIN = ("train", "--algorithm", "model-based", "--data")
+REFUSED = {
+    "column": (("shadow", "tuned", "--column", "P2=PI-1", "--data"), "no column 'PI-1'"),
+    "variable": (("shadow", "tuned", "--column", "P3=PI-1", "--data"), "no variable 'P3'"),
+    "plant": ((*TRAIN[:-1], "--samples", 100, "--data"), "--samples has no part"),
+    "rule": (("train", "-a", "q-learning", "--data"), "q-learning cannot learn from logged data"),
+    "sensors": ((*TRAIN[:-1], "--scenario", "late", "--data"), "has sensors"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_is_refused_in_one_line(cosim, log, case):
+    words, message = REFUSED[case]
+    code, out, err = cosim(*words, log, "--out", "run")
+    assert (code, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_columns_without_data_are_refused(cosim):
+    code, _, err = cosim("train", "-a", "model-based", "--column", "P2=x", "--out", "run")
+    assert code == 2
+    assert "--column belongs to --data" in err

@@ -332,7 +332,15 @@ def _train(run: TrainingRun, problem: Problem, data: LoggedData) -> TrainingFrom
     except DivergenceError as error:
         status = f"diverged: {error}"
 
-    prediction = _Prediction(problem, rollout, model, inputs, outputs, settings)
+    prediction = _Prediction(
+        problem,
+        rollout,
+        model,
+        inputs,
+        outputs,
+        settings,
+        data.follows,
+    )
     draws = prediction.draws([theta, start.theta], rng)
     of_learned = draws.costs[0]
     of_start = draws.costs[1]
@@ -689,7 +697,8 @@ class _Prediction:
         model: the estimate from the log.
         inputs: (s, a), (M, n+m).
         outputs: (s₊, ℓ), (M, K).
-        settings: of the expected penalty.
+        settings: of the fit and of the expected penalty.
+        follows: whether each transition begins where the one before ends, (M,).
     """
 
     def __init__(
@@ -700,10 +709,12 @@ class _Prediction:
         inputs: Array,
         outputs: Array,
         settings: ModelBasedConfiguration,
+        follows: NDArray[np.bool_],
     ) -> None:
         self._problem = problem
         self._rollout = rollout
         self._model = model
+        self._follows = follows
         self._inputs = inputs
         self._outputs = outputs
         self._settings = settings
@@ -720,8 +731,16 @@ class _Prediction:
         outside = []
         low = self._inputs.min(axis=0)
         high = self._inputs.max(axis=0)
-        for number in range(DRAWS):
-            model, errors_before = self._drawn(rng)
+        models = self._model.draws(
+            self._inputs,
+            self._outputs,
+            self._settings,
+            DRAWS,
+            rng,
+            self._follows,
+        )
+        for number, drawn in enumerate(models):
+            model, errors_before = self._repeating(drawn)
             expected = ExpectedCosts(self._problem, model, self._settings)
             predicted, h, _ = model.predict(self._inputs)
             persists = h * (errors_before @ model.persistence.T)
@@ -742,25 +761,22 @@ class _Prediction:
                 outside.append(float(is_outside.any(axis=1).mean()))
         return _Draws(costs, logged, float(np.mean(outside)) if outside else 1.0)
 
-    def _drawn(self, rng: np.random.Generator) -> tuple[EmpiricalModel, Array]:
-        """A model from the posterior with the errors that it makes of the log, in their order.
+    def _repeating(self, drawn: EmpiricalModel) -> tuple[EmpiricalModel, Array]:
+        """A model with the errors that it makes of the log, in their order.
 
         Under the logged actions it repeats the log, whatever its coefficients.
+
+        Args:
+            drawn: the model.
 
         Returns:
             The model, and r of the sample before each, (M, K).
         """
-        model = self._model
-        mean = rng.multivariate_normal(model.mean, model.covariance, method="eigh")
-        p = model.features.n_parameters
-        largest = self._settings.largest_parameter_error
-        mean[:p] = mean[:p].clip(-largest, largest)
-        drawn = replace(model, mean=mean)
         predicted, h, _ = drawn.predict(self._inputs)
         errors = (self._outputs - predicted) / h
         # The first one has none before it; of a gap the last one before it counts.
         before = np.concatenate([errors[:1], errors[:-1]])
-        residuals = errors - before @ model.persistence.T
+        residuals = errors - before @ drawn.persistence.T
         return replace(drawn, residuals=residuals), before
 
 
@@ -788,9 +804,11 @@ def difference(costs: Array, others: Array) -> tuple[Estimate, float]:
     blocks = np.array([block.mean() for block in np.array_split(by_sample, BLOCKS)])
     of_chance = float(blocks.var(ddof=1)) / BLOCKS
     variance = of_models + of_chance
-    quantile = float(stdtrit(BLOCKS - 1, 0.5 + LEVEL / 2))
-    half_width = quantile * variance**0.5
     share = of_models / variance if variance else 0.0
+    # Degrees of freedom of a sum of two variances (Welch and Satterthwaite).
+    freedom = 1.0 / (share**2 / (DRAWS - 1) + (1.0 - share) ** 2 / (BLOCKS - 1))
+    quantile = float(stdtrit(freedom, 0.5 + LEVEL / 2))
+    half_width = quantile * variance**0.5
     return Estimate(value, (value - half_width, value + half_width)), share
 
 

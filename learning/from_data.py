@@ -55,8 +55,10 @@ SHIFTS = (-2, -1, 1, 2)
 """Rows by which the inputs may be logged early or late, to be looked for."""
 EVIDENCE = 10.0
 """Nats by which the log must speak for another reading of itself to be refused."""
-UNLIKE = 10.0
+UNLIKE = 5.0
 """Times that the nominal model may err as much as "nothing changes" does, before it is no model."""
+BIASED = 0.5
+"""Mean error that it must have for that, over h: as of disturbances half their magnitude off."""
 JUMP = 10.0
 """Standard deviations, by the median, from which on an error is a fault of the log."""
 DRAWS = 24
@@ -66,7 +68,7 @@ BLOCKS = 16
 COST_NOISE = 1e-4
 """Size of the noise that a cost gets which is the model's own, as a share of its mean."""
 SETTLING = 300
-"""Samples of a rollout before it counts."""
+"""Samples of a rollout, and of the log, before they count: a quarter of the log at most."""
 HARDLY_SHOWN = 0.5
 """Share of the prior variance of a parameter left by the log from which on it does not show it."""
 
@@ -511,8 +513,8 @@ def _check_reading(data: LoggedData, scenario: Scenario, features: Features) -> 
     for i, name in enumerate(plant.states):
         error = float(np.sqrt(np.mean(errors[:, i] ** 2)))
         change = float(np.sqrt(np.mean(changes[:, i] ** 2)))
-        beyond_disturbances = abs(float(errors[:, i].mean())) > 1.0
-        if error > UNLIKE * change and beyond_disturbances:
+        is_biased = abs(float(errors[:, i].mean())) > BIASED
+        if error > UNLIKE * change and is_biased:
             raise LoggedDataError(
                 f"the model predicts {name} {error / change:.0f} times worse than that it stays as "
                 "it is: a unit or a column is wrong, or the model is of another plant"
@@ -675,7 +677,7 @@ def _replayed(
 
 
 class _Draws(NamedTuple):
-    """Costs that drawn models predict, D models of M samples.
+    """Costs that drawn models predict, D models of the M samples that count.
 
     Attributes:
         costs: of each θ, (D, M) each; infinite where a model's rollout is lost.
@@ -721,13 +723,13 @@ class _Prediction:
 
     def draws(self, thetas: Sequence[Vector], rng: np.random.Generator) -> _Draws:
         """Costs of θ, (n_θ,) each, and of the log, by models drawn from the posterior."""
+        # All begin at the log's first state, and count once they have settled.
         count = len(self._inputs)
-        settling = min(SETTLING, count)
-        # The log's last errors let the loop settle, then all of them come in their order.
-        picks = np.concatenate([np.arange(count - settling, count), np.arange(count)])
-        start = self._inputs[-settling, : self._problem.n_states]
-        costs = [np.full((DRAWS, count), np.inf) for _ in thetas]
-        logged = np.empty((DRAWS, count))
+        settling = min(SETTLING, count // 4)
+        picks = np.arange(count, dtype=np.int32)
+        start = self._inputs[0, : self._problem.n_states]
+        costs = [np.full((DRAWS, count - settling), np.inf) for _ in thetas]
+        logged = np.empty((DRAWS, count - settling))
         outside = []
         low = self._inputs.min(axis=0)
         high = self._inputs.max(axis=0)
@@ -744,11 +746,12 @@ class _Prediction:
             expected = ExpectedCosts(self._problem, model, self._settings)
             predicted, h, _ = model.predict(self._inputs)
             persists = h * (errors_before @ model.persistence.T)
-            logged[number], _ = expected(predicted + persists, h)
-            rollouts = self._rollout(thetas, start, model, picks.astype(np.int32))
+            logged_costs, _ = expected(predicted + persists, h)
+            logged[number] = logged_costs[settling:]
+            rollouts = self._rollout(thetas, start, model, picks)
             for cost, samples in zip(costs, rollouts, strict=True):
                 # A loop that runs away ends early.
-                if len(samples.inputs) < len(picks):
+                if len(samples.inputs) < count:
                     continue
                 with np.errstate(over="ignore", invalid="ignore"):
                     all_costs, _ = expected(samples.predicted, samples.h)
@@ -774,8 +777,8 @@ class _Prediction:
         """
         predicted, h, _ = drawn.predict(self._inputs)
         errors = (self._outputs - predicted) / h
-        # The first one has none before it; of a gap the last one before it counts.
-        before = np.concatenate([errors[:1], errors[:-1]])
+        # A rollout begins without one, and after a gap goes on from the last one before it.
+        before = np.concatenate([np.zeros_like(errors[:1]), errors[:-1]])
         residuals = errors - before @ drawn.persistence.T
         return replace(drawn, residuals=residuals), before
 

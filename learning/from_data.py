@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -60,7 +60,11 @@ UNLIKE = 5.0
 BIASED = 0.5
 """Mean error that it must have for that, over h: as of disturbances half their magnitude off."""
 JUMP = 10.0
-"""Standard deviations, by the median, from which on an error is a fault of the log."""
+"""Standard deviations, by the median, from which on an error is a jump."""
+ALIKE = 4.0
+"""Largest ratio of the two jumps, over h, which is another one where the reading is."""
+DROPOUT = 10
+"""Most rows from a jump to the one back."""
 DRAWS = 24
 """Models that are drawn from the posterior."""
 BLOCKS = 16
@@ -425,7 +429,7 @@ def usable(
     """
     data = data.latest(settings.memory)
     _check_reading(data, scenario, features)
-    data = data.without(_jumps(data, features), "jump that no plant makes")
+    data = data.without(_jumps(data, features), "jump there and back")
     inputs, outputs = _table(data, features)
     n_outdated = PlantData(features, settings).outdated(inputs, outputs)
     before_a_change = np.arange(len(data)) < n_outdated
@@ -449,12 +453,22 @@ def _nominal_errors(
 
 
 def _log_likelihood(errors: Array, rounding: Array) -> float:
-    """Of normal errors (M, n) of unknown mean and covariance, but for a constant."""
-    centred = errors - errors.mean(axis=0)
-    covariance = centred.T @ centred / len(errors)
+    """Of normal errors (M, n) of mean zero and unknown covariance, but for a constant."""
+    covariance = errors.T @ errors / len(errors)
     least = np.diag((rounding**2).mean(axis=0))
     _, logarithm = np.linalg.slogdet(covariance + least)
     return float(-len(errors) * logarithm / 2)
+
+
+def _gain(reading: tuple[Array, Array], as_it_is: tuple[Array, Array]) -> float:
+    """Nats by which a reading's errors (M, n) are likelier than those of the log as it is."""
+    return _log_likelihood(*reading) - _log_likelihood(*as_it_is)
+
+
+def _centred(reading: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Errors (M, n) less their mean, and the least deviations."""
+    errors, rounding = reading
+    return errors - errors.mean(axis=0), rounding
 
 
 def _check_reading(data: LoggedData, scenario: Scenario, features: Features) -> None:
@@ -479,22 +493,25 @@ def _check_reading(data: LoggedData, scenario: Scenario, features: Features) -> 
     next_states = data.next_states[rows]
 
     as_it_is = _nominal_errors(features, states, actions, next_states)
-    likelihood = _log_likelihood(*as_it_is)
-    readings: dict[str, tuple[Array, Array, Array]] = {}
+    gains = {}
+    # A shift leaves the mean error as it is, which is the plant's own.
     for shift in SHIFTS:
         way = "late" if shift > 0 else "early"
         words = f"the inputs are logged {abs(shift)} row{'s' * (abs(shift) > 1)} {way}"
-        readings[words] = (states, data.actions[rows + shift], next_states)
+        reading = _nominal_errors(features, states, data.actions[rows + shift], next_states)
+        gains[words] = _gain(_centred(reading), _centred(as_it_is))
+    # Exchanged columns have another mean, and may make the model's states stand still: it counts.
     for one, other in combinations(range(len(plant.actions)), 2):
         words = f"columns {plant.actions[one]} and {plant.actions[other]} are exchanged"
-        readings[words] = (states, _exchanged(actions, one, other), next_states)
+        exchanged = _exchanged(actions, one, other)
+        reading = _nominal_errors(features, states, exchanged, next_states)
+        gains[words] = _gain(reading, as_it_is)
     for one, other in combinations(range(len(plant.states)), 2):
         words = f"columns {plant.states[one]} and {plant.states[other]} are exchanged"
         exchanged = _exchanged(states, one, other)
-        readings[words] = (exchanged, actions, _exchanged(next_states, one, other))
-    gains = {}
-    for words, reading in readings.items():
-        gains[words] = _log_likelihood(*_nominal_errors(features, *reading)) - likelihood
+        followers = _exchanged(next_states, one, other)
+        reading = _nominal_errors(features, exchanged, actions, followers)
+        gains[words] = _gain(reading, as_it_is)
     best = max(gains, key=lambda words: gains[words])
     if gains[best] > EVIDENCE:
         raise LoggedDataError(
@@ -529,14 +546,24 @@ def _exchanged(table: Array, one: int, other: int) -> Array:
 
 
 def _jumps(data: LoggedData, features: Features) -> NDArray[np.bool_]:
-    """Transitions in which a state jumps as no plant does, (M,): a spike of a sensor, say."""
+    """Transitions of a reading that leaves the plant's and comes back, (M,): a spike, a dropout.
+
+    A disturbance of the plant, be it as large, does not jump back by itself.
+    """
     errors, rounding = _nominal_errors(features, data.states, data.actions, data.next_states)
-    distance = np.abs(errors - np.median(errors, axis=0))
+    distance = errors - np.median(errors, axis=0)
     # The median's deviation is not moved by the jumps themselves.
-    deviation = 1.4826 * np.median(distance, axis=0)
+    deviation = 1.4826 * np.median(np.abs(distance), axis=0)
     deviation = np.maximum(deviation, rounding.mean(axis=0))
-    is_jump: NDArray[np.bool_] = np.logical_or.reduce(distance > JUMP * deviation, axis=1)
-    return is_jump
+    jumps = np.zeros(len(data), bool)
+    for size in (distance / deviation).T:
+        large = np.flatnonzero(np.abs(size) > JUMP)
+        for there, back in pairwise(large.tolist()):
+            ratio = -size[back] / size[there]
+            is_near = back - there <= DROPOUT
+            if is_near and data.follows[there + 1 : back + 1].all() and 1 / ALIKE < ratio < ALIKE:
+                jumps[there : back + 1] = True
+    return jumps
 
 
 def _fitted(
@@ -586,7 +613,9 @@ class _OnALog(ModelBased):
         base, gained = self.corrected(present, model, recent)
         # What c_f and the parameters correct, back-offs need not hold any more.
         shift = np.concatenate([gained, -gained])
-        kept = np.maximum(self.back_off + shift, 0.0)
+        distance = self._problem.state_upper - self._problem.state_lower
+        most = np.tile(settings.largest_back_off * distance, 2)
+        kept = np.clip(self.back_off + shift, 0.0, most)
         least = self.least_back_offs(kept, inputs)
         search = BackOffOnModel(
             self._problem,

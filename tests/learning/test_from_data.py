@@ -88,9 +88,14 @@ def test_a_spike_of_a_sensor_is_left_out(data, paper, features):
     data.next_states[100, 0] += 20.0
     data.states[101, 0] += 20.0
     used = usable(data, paper, features, SETTINGS)
-    assert used.left_out == {"jump that no plant makes": 2}
+    assert used.left_out == {"jump there and back": 2}
     assert not np.isin([6000.0, 6060.0], used.time).any()
     assert not used.follows[100]
+
+
+def test_a_jump_that_stays_is_the_plants(data, paper, features):
+    data.next_states[100, 0] += 20.0
+    assert usable(data, paper, features, SETTINGS).left_out == {}
 
 
 def test_an_older_part_than_is_remembered_is_counted(data, paper, features):

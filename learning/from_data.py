@@ -69,6 +69,8 @@ DRAWS = 24
 """Models that are drawn from the posterior."""
 BLOCKS = 16
 """Stretches of the log by whose spread the chance of disturbances is told."""
+LOST = 1e6
+"""Times the largest cost of the log beyond which a rollout has run away."""
 COST_NOISE = 1e-4
 """Size of the noise that a cost gets which is the model's own, as a share of its mean."""
 SETTLING = 300
@@ -777,6 +779,7 @@ class _Prediction:
             persists = h * (errors_before @ model.persistence.T)
             logged_costs, _ = expected(predicted + persists, h)
             logged[number] = logged_costs[settling:]
+            limit = LOST * float(np.abs(logged_costs).max())
             rollouts = self._rollout(thetas, start, model, picks)
             for cost, samples in zip(costs, rollouts, strict=True):
                 # A loop that runs away ends early.
@@ -784,7 +787,8 @@ class _Prediction:
                     continue
                 with np.errstate(over="ignore", invalid="ignore"):
                     all_costs, _ = expected(samples.predicted, samples.h)
-                if np.isfinite(all_costs).all():
+                # A NaN is not below, either.
+                if (np.abs(all_costs) < limit).all():
                     cost[number] = all_costs[settling:]
             n = self._problem.n_states
             states = rollouts[0].inputs[settling:, :n]

@@ -23,7 +23,7 @@ def logged(scenario, name, samples, folder):
     return run.write_csv(folder / "log.csv")
 
 
-@pytest.mark.parametrize("name", ["pi", "tuned"])
+@pytest.mark.parametrize("name", ["pi", pytest.param("tuned", marks=pytest.mark.slow)])
 def test_a_controller_in_its_own_shadow_does_the_same(paper, tmp_path, name):
     path = logged(paper, name, 60, tmp_path)
     result = shadowed(paper, name, path)

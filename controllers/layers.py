@@ -35,6 +35,7 @@ def torch_layer(controller: RtiNmpc) -> Layer:
     torch = _module("torch")
 
     def to_numpy(argument: Any) -> Any:
+        # Gradients do not pass the solver: `backward` has them.
         if torch.is_tensor(argument):
             return argument.detach().cpu()
         return argument

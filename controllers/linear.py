@@ -128,6 +128,7 @@ def pairing(gains: Array) -> NDArray[np.intp]:
         relative = by_state.T
     except np.linalg.LinAlgError:  # not square, or singular
         relative = np.zeros_like(gains.T)
+    # Relative gains have no unit: they can be compared, with each other and with 1.
     distance = np.abs(relative - 1.0)
     actions, states = linear_sum_assignment(distance)
     chosen = relative[actions, states]

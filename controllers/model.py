@@ -94,6 +94,7 @@ class ModelFunction:
             result = self.function(*arguments)
             column: Any = _column(result)
         except ModelError:
+            # A model inside of this one has said already what is wrong.
             raise
         except Exception as error:  # the user's code may raise anything
             raise self.error(_meaning(error)) from error

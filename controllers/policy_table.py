@@ -139,6 +139,7 @@ class CompiledTable:
         points_of_axes = [len(axis) for axis in table.axes]
         sizes = np.array(points_of_axes, dtype=np.uintp)
         arrays: list[NDArray[Any]] = [sizes]
+        # In the order of the struct's pointers.
         numbers = [
             np.concatenate(table.axes),
             table.rows,

@@ -27,6 +27,7 @@ from cosim.core.scenario import Names, Table
 from cosim.core.validation import SchemaVersion, instead, validated
 
 
+# Kept: NumPy makes the indices out of a mask of the whole matrix, each time.
 @cache
 def upper_triangle(dimension: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of a matrix's upper triangle, row by row: the order of packed entries."""
@@ -369,6 +370,7 @@ class Parameters(Shown):
         """Raise ParameterError on an x_l not below its x_u or a slack weight not positive."""
         lower = self["x_l"]
         upper = self["x_u"]
+        # A QP of such bounds would fail in a sample, far from whoever has set θ.
         if not (lower < upper).all():
             raise ParameterError(f"θ: x_l = {lower} must stay below x_u = {upper}")
         for name in ("w_sigma", "W_sigma"):

@@ -346,7 +346,8 @@ def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
 SWITCH = "COSIM_COMPILE"
 CHOICES = ("auto", "never", "now")
 INTERPRETED, COMPILED = "interpreted", "compiled"
-FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
+FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared", "-fno-gcse-after-reload")
+"""For gcc and clang. What the last one forbids takes gcc a third of the time at 32 states."""
 LONG = 1000
 """Least samples of a run for which a controller is compiled; libraries are kept."""
 PATIENCE = 120.0

@@ -175,6 +175,8 @@ class ExtendedKalmanFilter:
             "disturbance_variance": model.n_disturbances,
             "drift_variance": model.n_drifts,
             "sensor_variance": n_sensors,
+            # C has no array of no entry.
+            "sigma": max(len(model.signals), 1),
             "states": n_all,
             "covariance": n_all * n_all,
         }
@@ -188,6 +190,7 @@ class ExtendedKalmanFilter:
         self._disturbance_variance = memory[places["disturbance_variance"]]
         self._drift_variance = memory[places["drift_variance"]]
         self._sensor_variance = memory[places["sensor_variance"]]
+        self._sigma = memory[places["sigma"]]
         # One after the other, as in `noise`.
         first = places["disturbance_variance"].start
         self._variances = memory[first : places["sensor_variance"].stop]
@@ -283,6 +286,8 @@ class ExtendedKalmanFilter:
         self._states[:] = self.model.start
         self._covariance[:] = 0.0
         self._covariance[:n, :n] = np.diag(self.model.start_deviation**2)
+        for number, (_, item) in enumerate(self.model.signals):
+            self._sigma[number] = item.nominal
         self._log_likelihood[0] = 0.0
         self.standardised[:] = np.nan
         if self.sensitivities is not None:
@@ -335,6 +340,8 @@ class ExtendedKalmanFilter:
     def state_dict(self) -> dict[str, Vector]:
         """All that the filter remembers."""
         state = {"states": self._states.copy(), "covariance": self._covariance.copy()}
+        if self.model.signals:
+            state["sigma"] = self._sigma.copy()
         if self.sensitivities is not None:
             state |= self.sensitivities.state_dict()
         return state
@@ -343,8 +350,19 @@ class ExtendedKalmanFilter:
         """Restore what `state_dict` returned."""
         self._states[:] = state["states"]
         self._covariance[:] = state["covariance"]
+        if self.model.signals:
+            self._sigma[:] = state["sigma"]
         if self.sensitivities is not None:
             self.sensitivities.load_state_dict(state)
+
+    def inform(self, known: Mapping[str, Vector]) -> None:
+        """Take up what signals of the model are from the present sample to the next.
+
+        Args:
+            known: Of each known signal, by its name, its present value first.
+        """
+        for number, (_, item) in enumerate(self.model.signals):
+            self._sigma[number] = known[item.signal][0]
 
     def predict(self, a: ArrayLike) -> None:
         """Go on by a sample; a prediction that is not finite makes it forget every reading.
@@ -370,6 +388,7 @@ class ExtendedKalmanFilter:
         step = self._transition
         step.inputs["z"][:] = self._states[0]
         step.inputs["u"][:] = a
+        step.inputs["sigma"][:] = self._sigma[: len(self.model.signals)]
         step()
         A = step.matrix("A").T
         G = step.matrix("G").T
@@ -488,6 +507,7 @@ class ExtendedKalmanFilter:
         n = problem.n_states
         step.inputs["z"][:] = self.model.start
         step.inputs["u"][:] = problem.reference_action
+        step.inputs["sigma"][:] = [item.nominal for _, item in self.model.signals]
         step()
         # In the widths of the bounds, so that no unit decides.
         widths = bound_widths(problem)
@@ -572,6 +592,7 @@ class OutputFeedback:
             self._noise_place = parameters.blocks.slices["noise"]
             self._set_noise()
         self._last_action: Vector | None = None
+        self._known: Mapping[str, Vector] | None = None
         self._is_predicted = True
         self._is_corrected = False
 
@@ -642,6 +663,7 @@ class OutputFeedback:
         self.estimator.reset()
         self.controller.reset()
         self._last_action = None
+        self._known = None
         self._is_predicted = True
         self._is_corrected = False
 
@@ -658,11 +680,25 @@ class OutputFeedback:
         """Reset the controller and keep the estimate: what follows a failed solve."""
         self.controller.reset()
 
+    def inform(self, known: Mapping[str, Vector]) -> None:
+        """Take up what is known of the scenario's signals at the sample to come.
+
+        Args:
+            known: Of each known signal, by its name, its values from that sample on.
+        """
+        self._known = known
+        if hasattr(self.controller, "inform"):
+            self.controller.inform(known)
+
     def prepare(self) -> None:
         """Predict the state, and do the controller's work that needs no measurement."""
-        self._set_noise()
+        if self._noise_place is not None:
+            self._set_noise()
         if not self._is_predicted and self._last_action is not None:
             self.estimator.predict(self._last_action)
+        # Only now: the prediction was of the sample before.
+        if self._known is not None and isinstance(self.estimator, ExtendedKalmanFilter):
+            self.estimator.inform(self._known)
         self._is_predicted = True
         self._is_corrected = False
         self.controller.prepare()
@@ -675,13 +711,16 @@ class OutputFeedback:
                 leaves the estimate as it is.
             a: Action to which the first one is fixed, (m,); without it the controller chooses.
         """
-        if not self._is_corrected:
-            self.estimator.correct(np.asarray(y, dtype=np.float64))
+        if self._is_corrected:
+            estimate = self.estimator.estimate
+        else:
+            estimate = self.estimator.correct(np.asarray(y, dtype=np.float64))
             self._is_corrected = True
-        solution = self.controller.feedback(self.estimator.estimate, a)
+        solution = self.controller.feedback(estimate, a)
         if self._noise_place is not None:
             solution = self._differentiated(solution)
-        self.applied(solution.action if a is None else a)
+        self._last_action = solution.action if a is None else a
+        self._is_predicted = False
         return solution
 
     def _set_noise(self) -> None:

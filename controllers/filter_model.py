@@ -1,6 +1,7 @@
 """What an extended Kalman filter computes with: the model's step, its outputs, where it starts.
 
-The filter's state z is the model's, and behind it the parameters that the model calls uncertain.
+The filter's state z is the model's, and behind it the parameters that the model calls uncertain. A
+disturbance or parameter that a known signal is has the signal's present value.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from controllers.errors import ModelError
 from controllers.functions import Definition, StackedFunction, define
 from controllers.model import discretise
 from controllers.problem import Problem
+from controllers.varying import Varying, of_kind
 from cosim.core.protocols import Vector
 from cosim.core.scenario import SensorTable
 
@@ -30,13 +32,16 @@ class FilterModel:
     """A model and its sensors, as a filter has them.
 
     Attributes:
-        transition: z₊ (`z_next`), A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u).
+        transition: z₊ (`z_next`), A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by
+            (z, u, σ).
         output: What the sensors read, `y` (n_y,), and C = ∂y/∂z, by z.
         variables: What each sensor reads, by name.
         delays: Samples from a reading of each sensor to its arrival.
         n_drifts: Number of uncertain parameters, the last entries of z.
         start: z before the first reading, (n,).
         start_deviation: Expected deviations of z from there, (n,).
+        signals: σ: the disturbances and parameters that known signals are, each with its row among
+            all that varies.
     """
 
     transition: Definition
@@ -46,6 +51,7 @@ class FilterModel:
     n_drifts: int
     start: Vector
     start_deviation: Vector
+    signals: tuple[tuple[int, Varying], ...] = ()
 
     @property
     def n_disturbances(self) -> int:
@@ -74,19 +80,49 @@ def filter_model(
         uncertain: Places of the parameters that are states of the filter.
 
     Raises:
-        ModelError: A sensor reads what is neither a state nor an output.
+        ModelError: A sensor reads what is neither a state nor an output, or what a signal changes;
+            or a parameter is both uncertain and known.
     """
+    signals = tuple(of_kind(problem.varying, "disturbance", "parameter"))
+    _require_clear(problem, sensors, uncertain, signals)
     nominal = problem.model.nominal_parameters[list(uncertain)]
     deviations = (INITIAL_DEVIATION * bound_widths(problem), UNCERTAIN * np.abs(nominal))
     return FilterModel(
-        transition=_transition(problem, uncertain),
+        transition=_transition(problem, uncertain, signals),
         output=_output(problem, sensors, uncertain),
         variables=tuple(sensor.variable for sensor in sensors),
         delays=tuple(sensor.delay for sensor in sensors),
         n_drifts=len(uncertain),
         start=np.concatenate([problem.reference_state, nominal]),
         start_deviation=np.concatenate(deviations),
+        signals=signals,
     )
+
+
+def _require_clear(
+    problem: Problem,
+    sensors: Sequence[SensorTable],
+    uncertain: Sequence[int],
+    signals: Sequence[tuple[int, Varying]],
+) -> None:
+    """Raise ModelError where a signal's parameter is uncertain, or a sensor's reading has it."""
+    symbols = problem.model.symbols()
+    for _, item in signals:
+        if item.kind != "parameter":
+            continue
+        name = problem.model.parameters[item.place].name
+        if item.place in uncertain:
+            raise ModelError(
+                f"signal '{item.signal}' says what the model's parameter {name} is, which the "
+                "model calls uncertain: one of both"
+            )
+        for sensor in sensors:
+            output = problem.model.outputs.get(sensor.variable)
+            if output and ca.depends_on(ca.SX(output(*symbols)), symbols[3][item.place]):
+                raise ModelError(
+                    f"the estimator cannot read '{sensor.variable}', which depends on parameter "
+                    f"{name} of the model, which signal '{item.signal}' moves"
+                )
 
 
 def bound_widths(problem: Problem) -> Vector:
@@ -109,20 +145,31 @@ def _with_uncertain(problem: Problem, uncertain: Sequence[int]) -> tuple[ca.SX, 
     return z, p
 
 
-def _transition(problem: Problem, uncertain: Sequence[int]) -> Definition:
-    """z₊, A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u)."""
+def _transition(
+    problem: Problem,
+    uncertain: Sequence[int],
+    signals: Sequence[tuple[int, Varying]],
+) -> Definition:
+    """z₊, A = ∂z₊/∂z and G = ∂z₊/∂d at the nominal disturbances, by (z, u, σ)."""
     model = problem.model
     f = discretise(model, problem.sampling_time, problem.substeps)
     z, p = _with_uncertain(problem, uncertain)
+    sigma = ca.SX.sym("sigma", len(signals))
+    nominal = ca.SX(ca.DM(model.nominal_disturbance))
+    for number, (_, item) in enumerate(signals):
+        known = nominal if item.kind == "disturbance" else p
+        known[item.place] = sigma[number]
     _, u, d, _ = model.symbols()
     x_next: Any = f(z[: problem.n_states], u, d, p)
     z_next = ca.vertcat(x_next, z[problem.n_states :])
     derivatives: Any = ca.Function(
-        "derivatives", [z, u, d], [z_next, ca.jacobian(z_next, z), ca.jacobian(z_next, d)]
+        "derivatives",
+        [z, u, sigma, d],
+        [z_next, ca.jacobian(z_next, z), ca.jacobian(z_next, d)],
     )
-    value, A, G = derivatives(z, u, ca.SX(ca.DM(model.nominal_disturbance)))
+    value, A, G = derivatives(z, u, sigma, nominal)
     results = {"z_next": value, "A": A, "G": G}
-    return define("estimator_transition", {"z": z, "u": u}, results)
+    return define("estimator_transition", {"z": z, "u": u, "sigma": sigma}, results)
 
 
 def _output(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from controllers.errors import ControllerError
 from controllers.export.core import (
     ENGINE_SOURCES,
@@ -37,7 +39,7 @@ def estimated_state(model: FilterModel, variances: Vector, *, in_theta: bool) ->
         rule="state_estimated.h",
         sources=filter_sources(model, variances=variances, in_theta=in_theta),
         # Before a sample's readings and behind them.
-        memory=2 * (model.n_noises + n_all + n_all**2),
+        memory=2 * (model.n_noises + max(len(model.signals), 1) + n_all + n_all**2),
         readings=model.variables,
         estimates=model.start.size,
     )
@@ -73,6 +75,9 @@ def filter_sources(
         "FILTER_Y": len(model.delays),
         "FILTER_KEPT": model.n_kept,
         "FILTER_NOISES": model.n_noises,
+        "FILTER_SIGNALS": len(model.signals),
+        # C has no array of no entry.
+        "FILTER_SIGMA": max(len(model.signals), 1),
     }
     for prefix, definition in definitions.items():
         sizes |= work_sizes(prefix, definition.function)
@@ -82,7 +87,13 @@ def filter_sources(
             sizes[f"{prefix}_{name}"] = start
             start += rows * columns
         sizes[f"{prefix}_SIZE"] = start
-    arrays = {"FILTER_START": model.start, "FILTER_START_DEVIATION": model.start_deviation}
+    nominal = [item.nominal for _, item in model.signals]
+    signal_rows = [row for row, _ in model.signals]
+    arrays = {
+        "FILTER_START": model.start,
+        "FILTER_START_DEVIATION": model.start_deviation,
+        "FILTER_NOMINAL": np.array(nominal or [0.0]),
+    }
     if variances is not None:
         arrays["FILTER_VARIANCES"] = variances
     functions = [definition.function for definition in definitions.values()]
@@ -91,6 +102,7 @@ def filter_sources(
         sizes="\n".join(f"    {name} = {value}," for name, value in sizes.items()),
         delays=", ".join(map(str, model.delays)),
         arrays="\n".join(array_text(name, values) for name, values in arrays.items()),
+        rows=", ".join(map(str, signal_rows or [0])),
         in_theta=str(int(in_theta)),
         functions=static_functions("filter", functions).decode(),
     )

@@ -619,16 +619,6 @@ class Scenario(Shown, Table):
         for signal in signals:
             self._check_signal(signal, f"signal '{signal.name}'")
         self._check_moving_bounds()
-        estimator = self.estimator or EstimatorTable()
-        is_filtered = self.sensors and estimator.kind == "ekf"
-        for signal in signals:
-            is_informed = signal.model is not None and signal.known != "none"
-            # The filter would take the model's nominal value, and its estimate be wrong.
-            if is_filtered and is_informed:
-                raise ValueError(
-                    f"signal '{signal.name}': the estimator 'ekf' does not know of a signal of the "
-                    "model; name another estimator.kind"
-                )
 
     def _check_signal(self, signal: SignalTable, where: str) -> None:
         """Raise ValueError where one signal does not fit the plant."""

@@ -1,5 +1,7 @@
 """The extended Kalman filter against Gaussian conditioning, and output feedback around it."""
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -11,10 +13,12 @@ from controllers.errors import ModelError
 from controllers.filter_model import INITIAL_DEVIATION
 from controllers.model import discretise
 from controllers.problem import Problem
+from controllers.varying import Varying
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.plugins import build_controller
 from cosim.core.protocols import Decision
 from cosim.core.scenario import SensorTable
+from tests.helpers.compiler import needs_compiler
 
 RATES = np.array([[-0.02, 0.01], [0.005, -0.03]])
 BY_ACTION = np.array([[0.1], [0.05]])
@@ -119,6 +123,73 @@ def test_it_is_gaussian_conditioning_on_all_that_arrived(first, second, seed):
         mean = A @ mean + B @ a
         slope = A @ slope
         slope[:, 2 + 2 * k : 4 + 2 * k] += G
+
+
+@pytest.mark.parametrize(
+    "compiles", [False, pytest.param(True, marks=[needs_compiler, pytest.mark.slow])]
+)
+def test_a_known_disturbance_acts_as_an_action_at_its_place(compiles):
+    """Theory: where u and d enter the model alike, knowing d is as good as having applied it."""
+    model = dataclasses.replace(
+        linear_model(), ode=lambda x, u, d, p: ca.DM(RATES) @ x + ca.DM(BY_ACTION) @ (u + d[0])
+    )
+    known = Varying("feed", "disturbance", 0, 0.0)
+    problems = [linear_problem(model)]
+    problems.append(dataclasses.replace(problems[0], varying=(known,)))
+    tables = [SensorTable(variable="a", deviation=0.3, delay=2)]
+    filters = [ExtendedKalmanFilter(problem, tables) for problem in problems]
+    if compiles:
+        for each in filters:
+            each.compile()
+            assert each.functions == "compiled"
+    rng = np.random.default_rng(2)
+    for k in range(20):
+        y = [np.nan] if k < 2 else rng.normal(size=1)
+        a = rng.normal(size=1)
+        d = rng.normal(size=3)
+        # What is known ahead is the controller's.
+        filters[1].inform({"feed": d, "another": np.ones(1)})
+        assert np.allclose(filters[0].correct(y), filters[1].correct(y), rtol=1e-12, atol=1e-12)
+        filters[0].predict(a + d[0])
+        filters[1].predict(a)
+
+
+def test_the_prediction_is_of_what_was_known_at_the_sample_before():
+    problem = dataclasses.replace(
+        linear_problem(), varying=(Varying("feed", "disturbance", 0, 0.0),)
+    )
+    estimator = ExtendedKalmanFilter(problem, [SensorTable(variable="a")])
+    law = OutputFeedback(estimator, Half())
+    law.reset()
+    means = []
+    for feed in (2.0, 5.0):
+        law.inform({"feed": np.array([feed])})
+        law.prepare()
+        means.append(estimator.estimate)
+        law.feedback([np.nan], np.zeros(1))
+    f = discretise(problem.model, 1.0, 1)
+    expected = f(means[0], np.zeros(1), [2.0, 0.0], [])
+    assert np.allclose(means[1], np.array(expected).ravel(), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"uncertain": ("gain",)}, "one of both"),
+        ({"outputs": {"sum": lambda x, u, d, p: p[0] * x[0]}}, "cannot read 'sum'"),
+    ],
+)
+def test_a_parameter_that_is_a_signal_is_neither_uncertain_nor_read(changes, message):
+    model = dataclasses.replace(
+        linear_model(),
+        parameters=(Quantity("gain", "1", 1.0),),
+        ode=lambda x, u, d, p: ca.DM(RATES) @ x + p[0] * ca.DM(BY_ACTION) @ u,
+        **changes,
+    )
+    known = Varying("gain", "parameter", 0, 1.0)
+    problem = dataclasses.replace(linear_problem(model), varying=(known,))
+    with pytest.raises(ModelError, match=message):
+        ExtendedKalmanFilter(problem, [SensorTable(variable="sum")])
 
 
 def test_exact_sensors_at_each_sample_give_the_state():

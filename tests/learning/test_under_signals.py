@@ -65,12 +65,20 @@ def test_a_transition_has_the_bounds_of_its_samples():
             assert transition.next_penalty == penalty(transition.next_s.tolist())
 
 
-@pytest.mark.parametrize("name", ["prices", pytest.param("forecast", marks=pytest.mark.slow)])
-def test_a_resumed_training_gives_the_same_digits(tmp_path, name):
-    """The signals are those of the sample, the restored controller knows them."""
-    scenario = Scenario.load(name)
-    if name == "prices":
-        scenario = scenario.replace({"signal": [HOURS]})
+SLOW = {"variable": "X2", "every": 3}, {"variable": "P2", "deviation": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("prices", {"signal": [HOURS]}),
+        pytest.param("forecast", {}, marks=pytest.mark.slow),
+        pytest.param("forecast", {"sensor": SLOW}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_resumed_training_gives_the_same_digits(tmp_path, name, changes):
+    """The signals are those of the sample, the restored controller and its filter know them."""
+    scenario = Scenario.load(name).replace(changes)
     settings = {"prior_samples": 10, "step_every": 5}
     run = make_run(scenario=scenario, settings=settings, evaluation_seeds=0)
     whole = run_training(run, tmp_path / "whole")

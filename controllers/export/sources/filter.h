@@ -14,11 +14,12 @@
 
 enum { FILTER_ALL = FILTER_KEPT * FILTER_Z, FILTER_FIRST_SENSOR = FILTER_D + FILTER_DRIFTS };
 
-/* The variances are of the disturbances, of a drifting parameter's change in a sample, and of the
+/* σ are the known disturbances and parameters of the model. The variances are of the disturbances, of a drifting parameter's change in a sample, and of the
  * sensors; the covariance is that of all z that are kept. Doubles only, in the order in which Python
  * has them (`controllers.estimator`). */
 typedef struct {
     double variances[FILTER_NOISES];
+    double sigma[FILTER_SIGMA];
     double z[FILTER_KEPT][FILTER_Z];
     double covariance[FILTER_ALL][FILTER_ALL];
 } Filter;
@@ -43,8 +44,9 @@ static inline double filter_G(const FilterStep *step, int i, int j) {
     return step->stack[TRANSITION_G + j * FILTER_Z + i];
 }
 
-/* Forget every reading; the variances stay. */
+/* Forget every reading; the variances stay, and what is known is nominal. */
 static inline void filter_reset(Filter *filter) {
+    memcpy(filter->sigma, FILTER_NOMINAL, sizeof filter->sigma);
     for (int k = 0; k < FILTER_KEPT; k++)
         memcpy(filter->z[k], FILTER_START, sizeof filter->z[k]);
     memset(filter->covariance, 0, sizeof filter->covariance);
@@ -63,7 +65,7 @@ static inline int filter_finite(const Filter *filter) {
 }
 
 static void filter_step(const Filter *filter, const double u[], FilterStep *step) {
-    const double *arguments[TRANSITION_ARG] = {filter->z[0], u};
+    const double *arguments[TRANSITION_ARG] = {filter->z[0], u, filter->sigma};
     double *results[TRANSITION_RES] = {step->stack}, w[TRANSITION_W + 1];
     long long int iw[TRANSITION_IW + 1];
     if (estimator_transition(arguments, results, iw, w, 0)) step->stack[0] = NAN;

@@ -19,7 +19,8 @@ static void filter_slopes_move(FilterSlopes *slopes, const Filter *filter, const
         double (*const slope)[FILTER_ALL] = slopes->covariance[q];
         FilterStep moved;
         {
-            const double *arguments[TRANSITION_BY_Z_ARG] = {filter->z[0], u, slopes->z[q][0]};
+            const double *arguments[TRANSITION_BY_Z_ARG] = {filter->z[0], u, filter->sigma,
+                                                                slopes->z[q][0]};
             double *results[TRANSITION_BY_Z_RES] = {moved.stack}, w[TRANSITION_BY_Z_W + 1];
             long long int iw[TRANSITION_BY_Z_IW + 1];
             if (estimator_transition_by_z(arguments, results, iw, w, 0)) moved.stack[0] = NAN;

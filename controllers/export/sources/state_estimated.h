@@ -29,6 +29,8 @@ static inline const double *observer_take(Observer *observer, const double input
 #if FILTER_IN_THETA
     for (int i = 0; i < FILTER_NOISES; i++) filter->variances[i] = exp(theta[THETA_noise + i]);
 #endif
+    for (int i = 0; i < FILTER_SIGNALS; i++)
+        filter->sigma[i] = theta[N_THETA + FILTER_ROWS[i]];
     for (int i = 0; i < FILTER_Y; i++) {
         if (fresh[i] == 0.0 || !isfinite(inputs[i])) continue;
         FilterInnovation innovation;

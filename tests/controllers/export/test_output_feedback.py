@@ -11,6 +11,7 @@ from controllers.factories import nmpc, tuned
 from cosim import FmuPlant, Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_c
 from cosim.core.errors import CosimError
+from cosim.core.signals import Signals
 from fmus.build import build_model
 from tests.controllers.export.test_plain import built
 from tests.helpers.compiler import needs_compiler
@@ -26,6 +27,16 @@ LATE = {
 }
 
 
+FEED = {
+    "name": "feed",
+    "values": [5.0, 4.8, 5.1],
+    "period": 540.0,
+    "plant": "X1_nominal",
+    "model": "X1",
+    "known": "preview",
+}
+
+
 def with_noise(scenario):
     """A controller whose θ has variances of the filter, which are not the scenario's."""
     estimator = ExtendedKalmanFilter.from_scenario(scenario)
@@ -37,11 +48,14 @@ def closed_loop(scenario, controller, samples):
     """Readings of a run, NaN where nothing came, and the Python controller's actions and state."""
     law = OutputFeedback.from_scenario(scenario, controller)
     law.reset()
+    signals = Signals(scenario)
     readings, actions, estimates = [], [], []
     with FmuPlant(scenario) as plant:
         plant.reset(7)
-        for _ in range(samples):
-            readings.append(plant.y.copy())
+        for k in range(samples):
+            known = signals.known(k)
+            readings.append(np.concatenate([plant.y, *known.values()]))
+            law.inform(known)
             law.prepare()
             action = law.feedback(plant.y).action
             action = np.clip(action, scenario.action_lower, scenario.action_upper)
@@ -64,9 +78,9 @@ def printed(program, readings):
 @pytest.mark.parametrize(
     ("changes", "make", "samples"),
     [
-        (SHORT | LATE, with_noise, 100),
+        (SHORT | LATE | {"signal": [FEED]}, with_noise, 100),
         pytest.param({}, tuned, 500, marks=pytest.mark.slow),
-        pytest.param(LATE, with_noise, 500, marks=pytest.mark.slow),
+        pytest.param(SHORT | LATE, with_noise, 500, marks=pytest.mark.slow),
     ],
 )
 def test_plain_c_gives_the_actions_of_the_python_controller(tmp_path, changes, make, samples):

@@ -83,7 +83,7 @@ static int core_sample(const CoreGuess *guess, const double theta[], const doubl
     QP_SCRATCH RtiPrepared prepared;
     QP_SCRATCH RtiSolved solved;
     if (!well_posed(theta)) return RTI_ILL_POSED;
-    if (!all_finite(theta + N_THETA, N_GIVEN - N_THETA)) return QP_NOT_FINITE;
+    if (N_VARYING > 0 && !all_finite(theta + N_THETA, N_GIVEN - N_THETA)) return QP_NOT_FINITE;
     memcpy(prepared.x, guess->x, sizeof prepared.x);
     memcpy(prepared.u, guess->u, sizeof prepared.u);
     memcpy(prepared.costates, guess->costates, sizeof prepared.costates);

@@ -190,7 +190,7 @@ def shadow(controller: Controller, table: LogTable, scenario: Scenario) -> Shado
     left_out = {}
     for reason, count in (
         ("repeated row", table.repeated),
-        ("left out by order", int(table.excluded.sum())),
+        ("by order", int(table.excluded.sum())),
         ("missing value", int((is_missing & ~table.excluded).sum())),
     ):
         if count:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -61,8 +61,10 @@ BIASED = 0.5
 """Mean error that it must have for that, over h: as of disturbances half their magnitude off."""
 JUMP = 10.0
 """Standard deviations, by the median, from which on an error is a jump."""
-ALIKE = 4.0
-"""Largest ratio of the two jumps, over h, which is another one where the reading is."""
+JUMP_BACK = 4.0
+"""Standard deviations from which on an error after a jump may be the one back."""
+ALIKE = 2.0
+"""Largest ratio of the two jumps."""
 DROPOUT = 10
 """Most rows from a jump to the one back."""
 DRAWS = 24
@@ -557,15 +559,39 @@ def _jumps(data: LoggedData, features: Features) -> NDArray[np.bool_]:
     # The median's deviation is not moved by the jumps themselves.
     deviation = 1.4826 * np.median(np.abs(distance), axis=0)
     deviation = np.maximum(deviation, rounding.mean(axis=0))
+    sizes = np.abs(distance) / deviation
+    changes = data.next_states - data.states
     jumps = np.zeros(len(data), bool)
-    for size in (distance / deviation).T:
-        large = np.flatnonzero(np.abs(size) > JUMP)
-        for there, back in pairwise(large.tolist()):
-            ratio = -size[back] / size[there]
-            is_near = back - there <= DROPOUT
-            if is_near and data.follows[there + 1 : back + 1].all() and 1 / ALIKE < ratio < ALIKE:
+    for size, change in zip(sizes.T, changes.T, strict=True):
+        for there in np.flatnonzero(size > JUMP).tolist():
+            back = _jump_back(there, size, change, data.follows)
+            if back is not None:
                 jumps[there : back + 1] = True
     return jumps
+
+
+def _jump_back(
+    there: int,
+    size: Array,
+    change: Array,
+    follows: NDArray[np.bool_],
+) -> int | None:
+    """The transition in which a reading that has jumped comes back; None where it stays.
+
+    Args:
+        there: the transition of the jump.
+        size: of the errors of this state, in deviations, (M,).
+        change: of this state in each transition, (M,).
+        follows: whether the transition before ends where this one begins, (M,).
+    """
+    for later in range(there + 1, min(there + 1 + DROPOUT, len(size))):
+        if not follows[later]:
+            return None
+        # The model expects the plant to stay where the jump has led, not to come back.
+        is_error = size[later] > JUMP_BACK
+        if is_error and 1 / ALIKE < -change[later] / change[there] < ALIKE:
+            return later
+    return None
 
 
 def _fitted(

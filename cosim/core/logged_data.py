@@ -257,7 +257,7 @@ def transitions_of(table: LogTable, scenario: Scenario) -> LoggedData:
     reasons: dict[str, Flags] = {
         "gap in time": steps > GAP,
         "irregular clock": np.abs(steps - 1) > CLOCK_TOLERANCE,
-        "left out by order": table.excluded[first] | table.excluded[second],
+        "by order": table.excluded[first] | table.excluded[second],
         "missing value": states_missing[first] | states_missing[second] | others_missing[first],
     }
     for name, values in zip(scenario.plant.states, table.states.T, strict=True):

@@ -63,7 +63,7 @@ JUMP = 10.0
 """Standard deviations, by the median, from which on an error is a jump."""
 JUMP_BACK = 4.0
 """Standard deviations from which on an error after a jump may be the one back."""
-ALIKE = 2.0
+ALIKE = 1.3
 """Largest ratio of the two jumps."""
 DROPOUT = 10
 """Most rows from a jump to the one back."""

@@ -526,20 +526,39 @@ def _check_reading(data: LoggedData, scenario: Scenario, features: Features) -> 
 
     # "Nothing changes" is the poorest model; one that is far poorer has other units.
     errors, _ = as_it_is
-    _, _, h = features(
-        np.column_stack([states, actions]),
-        np.zeros(features.n_parameters),
-    )
+    inputs = np.column_stack([states, actions])
+    y, _, h = features(inputs, np.zeros(features.n_parameters))
     changes = (next_states - states) / h[:, : states.shape[1]]
     for i, name in enumerate(plant.states):
-        error = float(np.sqrt(np.mean(errors[:, i] ** 2)))
         change = float(np.sqrt(np.mean(changes[:, i] ** 2)))
-        is_biased = abs(float(errors[:, i].mean())) > BIASED
-        if error > UNLIKE * change and is_biased:
+        if _is_unlike(errors[:, i], change):
             raise LoggedDataError(
-                f"the model predicts {name} {error / change:.0f} times worse than that it stays as "
+                f"the model predicts {name} more than {UNLIKE:g} times worse than that it stays as "
                 "it is: a unit or a column is wrong, or the model is of another plant"
             )
+    if data.stage_cost is None:
+        return
+    stage_cost = data.stage_cost[rows]
+    cost_errors = (stage_cost - y[:, -1]) / h[:, -1]
+    spread = float(np.std(stage_cost / h[:, -1]))
+    if _is_unlike(cost_errors, spread):
+        raise LoggedDataError(
+            f"the logged stage cost is {stage_cost.mean():.6g} on average, and the model's "
+            f"{y[:, -1].mean():.6g}: another unit, or another cost? Without the column the model's "
+            "is taken"
+        )
+
+
+def _is_unlike(errors: Array, spread: float) -> bool:
+    """Whether a model's errors say that it is of something else, or in another unit.
+
+    Args:
+        errors: over h, (M,).
+        spread: root mean square of what they must be small against, over h.
+    """
+    size = float(np.sqrt(np.mean(errors**2)))
+    is_biased = abs(float(errors.mean())) > BIASED
+    return size > UNLIKE * spread and is_biased
 
 
 def _exchanged(table: Array, one: int, other: int) -> Array:

@@ -526,8 +526,7 @@ def _seconds(file: _File, position: int) -> Array:
     """Time of each row in s: numbers in the unit of the header, or dates of ISO 8601."""
     texts = file.texts(position)
     title = file.titles[position]
-    is_date = "-" in texts[0][1:] or ":" in texts[0]
-    if not is_date:
+    if not _is_date(texts[0]):
         unit = file.units[position] or "s"
         if unit not in SECONDS:
             raise LoggedDataError(
@@ -553,6 +552,15 @@ def _seconds(file: _File, position: int) -> Array:
                 "ISO 8601 like those before, 2024-01-31T12:00:00 say"
             ) from None
     return seconds
+
+
+def _is_date(text: str) -> bool:
+    """Whether a time is a date, and no number like 1e-3."""
+    try:
+        float(text)
+    except ValueError:
+        return "-" in text or ":" in text
+    return False
 
 
 def _excluded(file: _File, orders: Sequence[str]) -> Flags:

@@ -72,7 +72,11 @@ MISREAD = {
             states=data.states * [0.01, 1.0],
             next_states=data.next_states * [0.01, 1.0],
         ),
-        "predicts X2 .* times worse than that it stays",
+        "predicts X2 more than 5 times worse than that it stays",
+    ),
+    "cents": (
+        lambda data: replace(data, stage_cost=100.0 * data.stage_cost),
+        "logged stage cost is .* on average, and the model's",
     ),
 }
 

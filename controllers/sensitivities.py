@@ -95,7 +95,8 @@ class _Sensitivities:
     """Makes the gradient of the Lagrangian in θ and its derivatives, both by a sweep backward.
 
     A stage's part is a function of its own, called for each. It adds to the sum of the stages
-    behind it, so that the sum is that of one derivative of the whole Lagrangian, to the last bit.
+    behind it, in the order in which one derivative of the whole Lagrangian would: the bits are the
+    same.
 
     The QP's v, lam, matrices and directions are in units of `Problem.scale`, all else is in the
     model's.
@@ -163,15 +164,14 @@ class _Sensitivities:
         discounts = problem.discounts.tolist()
         references = self._references(inputs)
         columns = {name: ca.horzsplit(inputs[name]) for name in (*SOLUTION_PARTS, "x", "u")}
+        if self.exact:
+            columns["M"] = ca.horzsplit(inputs["M"], problem.n_states + problem.n_actions)
         stages = []
         for k in range(problem.horizon):
             stage = {name: by_stage[k] for name, by_stage in columns.items()}
             stage["chi"] = columns["chi"][k + 1]
             stage["discount"] = discounts[k]
             stage["next_discount"] = discounts[k + 1]
-            if self.exact:
-                width = problem.n_states + problem.n_actions
-                stage["M"] = ca.horzsplit(inputs["M"], width)[k]
             if self.moves:
                 stage["reference"] = references[k]
             stages.append(stage)
@@ -187,7 +187,9 @@ class _Sensitivities:
     def _gradient(self, stage: Mapping[str, ca.SX], total: ca.SX) -> ca.SX:
         """The sum of gradients `total` with a stage's, whose part is in the model's units."""
         theta = self.theta["theta"]
-        lagrangian = _stage_lagrangian(self.problem, self.theta, stage) + ca.dot(total, theta)
+        lagrangian = _stage_lagrangian(self.problem, self.theta, stage)
+        # CasADi differentiates from the end: the sum comes first, and the stage is added to it.
+        lagrangian += ca.dot(total, theta)
         return ca.gradient(lagrangian, theta)
 
     def _ends(self) -> dict[str, ca.SX]:

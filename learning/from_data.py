@@ -69,8 +69,8 @@ DROPOUT = 10
 """Most rows from a jump to the one back."""
 DRAWS = 24
 """Models that are drawn from the posterior."""
-BLOCKS = 16
-"""Stretches of the log by whose spread the chance of disturbances is told."""
+BLOCKS = (16, 8)
+"""Numbers of stretches of the log by whose spread the chance of disturbances is told."""
 LOST = 1e6
 """Times the largest cost of the log beyond which a rollout has run away."""
 COST_NOISE = 1e-4
@@ -882,12 +882,20 @@ def difference(costs: Array, others: Array) -> tuple[Estimate, float]:
     value = float(by_model.mean())
     of_models = float(by_model.var(ddof=1))
     by_sample = differences.mean(axis=0)
-    blocks = np.array([block.mean() for block in np.array_split(by_sample, BLOCKS)])
-    of_chance = float(blocks.var(ddof=1)) / BLOCKS
+    # Costs that are correlated for hours leave stretches that are not independent: the longer ones
+    # count where their means spread more.
+    of_chance = 0.0
+    freedom_of_chance = BLOCKS[0] - 1
+    for n_blocks in BLOCKS:
+        blocks = np.array([block.mean() for block in np.array_split(by_sample, n_blocks)])
+        of_the_mean = float(blocks.var(ddof=1)) / n_blocks
+        if of_the_mean >= of_chance:
+            of_chance = of_the_mean
+            freedom_of_chance = n_blocks - 1
     variance = of_models + of_chance
     share = of_models / variance if variance else 0.0
     # Degrees of freedom of a sum of two variances (Welch and Satterthwaite).
-    freedom = 1.0 / (share**2 / (DRAWS - 1) + (1.0 - share) ** 2 / (BLOCKS - 1))
+    freedom = 1.0 / (share**2 / (DRAWS - 1) + (1.0 - share) ** 2 / freedom_of_chance)
     quantile = float(stdtrit(freedom, 0.5 + LEVEL / 2))
     half_width = quantile * variance**0.5
     return Estimate(value, (value - half_width, value + half_width)), share

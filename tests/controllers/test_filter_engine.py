@@ -121,6 +121,7 @@ def test_readings_of_another_number_are_refused(y):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_it_is_compiled_with_the_controller_behind_it():
     scenario = Scenario.load("assay")
     law = OutputFeedback.from_scenario(scenario, naive(scenario))

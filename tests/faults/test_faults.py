@@ -196,8 +196,8 @@ def test_training_goes_on_through_solver_failures_and_counts_each(
     unreliable, interpreted, monkeypatch
 ):
     monkeypatch.setattr("controllers.rti.nmpc.make_backend", lambda name: unreliable())
-    every = {"log_every": 1000, "evaluate_every": 2000, "checkpoint_every": 2000}
-    result = run_training(make_run(samples=2000, evaluation_steps=1, **every))
+    every = {"log_every": 500, "evaluate_every": 1000, "checkpoint_every": 1000}
+    result = run_training(make_run(samples=1000, evaluation_steps=1, **every))
     assert result.status == "finished"
     failures = result.rows[-1]["failures"]
     # One-sample evaluations may fail too, and are not counted among the samples.

@@ -51,7 +51,7 @@ class PlainEstimate:
                 misfits.append(whitened @ residuals[i])
             A = np.vstack([*rows, np.diag(1 / prior)])
             wanted = np.concatenate([*misfits, -beta / prior])
-            beta = beta + np.linalg.lstsq(A, wanted, rcond=None)[0]
+            beta = beta + linalg.lstsq(A, wanted, lapack_driver="gelsy")[0]
         self.beta, self.covariance = beta, np.linalg.inv(A.T @ A)
         loss = (wanted**2).sum() / 2
         volume = np.linalg.slogdet(self.covariance)[1] / 2 - np.log(prior).sum()

@@ -129,6 +129,7 @@ def test_errors_do_not_persist_over_a_gap(features, rng):
     assert radius == pytest.approx(0.9, abs=0.15)
 
 
+@pytest.mark.slow
 def test_drawn_models_differ_but_explain_the_data(features, rng):
     inputs, outputs = plant_data(features, rng, 200, np.zeros(features.n_parameters))
     model = fit(features, inputs, outputs)

@@ -72,10 +72,11 @@ SLOW = {"variable": "X2", "every": 3}, {"variable": "P2", "deviation": 0.5}
     ("name", "changes"),
     [
         ("prices", {"signal": [HOURS]}),
-        pytest.param("forecast", {}, marks=pytest.mark.slow),
-        pytest.param("forecast", {"sensor": SLOW}, marks=pytest.mark.slow),
+        ("forecast", {}),
+        ("forecast", {"sensor": SLOW}),
     ],
 )
+@pytest.mark.slow
 def test_a_resumed_training_gives_the_same_digits(tmp_path, name, changes):
     """The signals are those of the sample, the restored controller and its filter know them."""
     scenario = Scenario.load(name).replace(changes)

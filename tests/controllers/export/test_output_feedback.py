@@ -96,7 +96,8 @@ def test_plain_c_gives_the_actions_of_the_python_controller(tmp_path, changes, m
 
 @needs_compiler
 @pytest.mark.usefixtures("quickly_built")
-@pytest.mark.parametrize("version", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("version", [2, 3])
 def test_the_fmu_gives_them_and_goes_on_from_its_bytes(tmp_path, version):
     """Actions and estimates of both; a second instance from bytes in the middle has the same."""
     scenario = Scenario.load("assay").replace(SHORT | LATE)

@@ -67,7 +67,8 @@ def test_plain_c_gives_the_actions_of_the_python_controller(tmp_path, name, chan
 
 
 @pytest.mark.usefixtures("quickly_built")
-@pytest.mark.parametrize("version", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("version", [2, 3])
 def test_the_fmu_gives_them_and_one_that_is_not_finite_is_a_failure(tmp_path, version):
     scenario = Scenario.load("paper").replace(HORIZON | {"signal": SIGNALS})
     states, knowns, actions = closed_loop(scenario, 30)

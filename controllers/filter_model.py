@@ -88,7 +88,7 @@ def filter_model(
     nominal = problem.model.nominal_parameters[list(uncertain)]
     deviations = (INITIAL_DEVIATION * bound_widths(problem), UNCERTAIN * np.abs(nominal))
     return FilterModel(
-        transition=_transition(problem, uncertain, signals),
+        transition=_augmented_transition(problem, uncertain, signals),
         output=_output(problem, sensors, uncertain),
         variables=tuple(sensor.variable for sensor in sensors),
         delays=tuple(sensor.delay for sensor in sensors),
@@ -145,7 +145,7 @@ def _with_uncertain(problem: Problem, uncertain: Sequence[int]) -> tuple[ca.SX, 
     return z, p
 
 
-def _transition(
+def _augmented_transition(
     problem: Problem,
     uncertain: Sequence[int],
     signals: Sequence[tuple[int, Varying]],

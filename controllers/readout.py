@@ -76,7 +76,7 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
             "theta": (given_size(problem, blocks), 1),
         }
     )
-    stages = _split(arguments, _stage_shapes(n, m))
+    stages = _arguments_by_stage(arguments, _stage_shapes(n, m))
     bounds = soft_bounds(problem, blocks, arguments["theta"])
     # The slack of stage k's end counts from k + 1.
     next_discounts = problem.discounts[1:].tolist()
@@ -108,7 +108,7 @@ def readout_definition(problem: Problem, blocks: ThetaBlocks) -> Definition:
 
     # Backward: costates and residual, from the gradient of the terminal cost to those of the
     # initial one.
-    end = _end(n)
+    end = _end_of_horizon(n)
     last = call(
         end,
         xi=xi[horizon],
@@ -261,7 +261,7 @@ def _bound_shapes(n: int) -> Shapes:
     return {**dict.fromkeys(names, (n, 1)), "next_discount": (1, 1)}
 
 
-def _split(arguments: Mapping[str, ca.MX], shapes: Shapes) -> list[dict[str, ca.MX]]:
+def _arguments_by_stage(arguments: Mapping[str, ca.MX], shapes: Shapes) -> list[dict[str, ca.MX]]:
     """The stages' parts of matrices that have them side by side, by stage."""
     parts = {}
     for name, (_, columns) in shapes.items():
@@ -341,7 +341,7 @@ def _forward(problem: Problem) -> ca.Function:
     return sweep_function("readout_forward", arguments, results)
 
 
-def _end(n: int) -> ca.Function:
+def _end_of_horizon(n: int) -> ca.Function:
     """The value with the terminal cost in it, that cost's gradient and curvature in ξ_N."""
     symbols = scalar_symbols(
         {
@@ -419,7 +419,7 @@ def _backward(problem: Problem) -> ca.Function:
         "next_chi": next_chi,
         "by_state": by_state,
         "curvature": curvatures[:n],
-        "largest": _largest([carried["residual"], *errors]),
+        "largest": _largest_entry([carried["residual"], *errors]),
     }
     return sweep_function("readout_backward", {**stage, **bounds, **carried}, results)
 
@@ -429,7 +429,7 @@ def _quadratic(hessian: ca.SX, gradient: ca.SX, w: ca.SX) -> ca.SX:
     return ca.bilin(hessian, w) / 2 + ca.dot(gradient, w)
 
 
-def _largest(vectors: list[ca.SX]) -> ca.SX:
+def _largest_entry(vectors: list[ca.SX]) -> ca.SX:
     """The largest of all entries of these vectors."""
     entries = ca.vertsplit(ca.vertcat(*vectors))
     largest = entries[0]

@@ -52,7 +52,7 @@ def varying_quantities(scenario: Scenario, model: Model) -> tuple[Varying, ...]:
         elif table.bound is not None:
             quantities.append(_bound(table, scenario))
         elif table.reference is not None:
-            quantities.append(_reference(table, table.reference, scenario))
+            quantities.append(_moving_reference(table, table.reference, scenario))
     return tuple(quantities)
 
 
@@ -94,7 +94,7 @@ def _bound(table: SignalTable, scenario: Scenario) -> Varying:
     return Varying(table.name, kind, index, nominal)
 
 
-def _reference(
+def _moving_reference(
     table: SignalTable,
     name: str,
     scenario: Scenario,

@@ -210,7 +210,7 @@ def _with_held_out_runs(
     if options.evaluation_steps is not None:
         return options
     # A part of a day says nothing of what the day costs.
-    longest = _whole(EVALUATION_STEPS, _period(scenario) or 1)
+    longest = _in_whole_periods(EVALUATION_STEPS, _period(scenario) or 1)
     if scenario.plant.fmu in SHIPPED_FMUS or not options.evaluation_seeds:
         return replace(options, evaluation_steps=longest)
     assert options.evaluate_every is not None
@@ -375,10 +375,10 @@ def _shift_samples(hours: float, scenario: Scenario) -> int | None:
     """
     shift = round(3600.0 * hours / scenario.sampling_time)
     period = _period(scenario)
-    return None if period is None else _whole(shift, period)
+    return None if period is None else _in_whole_periods(shift, period)
 
 
-def _whole(samples: int, period: int) -> int:
+def _in_whole_periods(samples: int, period: int) -> int:
     """The least multiple of a period from so many samples on."""
     return -(-samples // period) * period
 

@@ -21,7 +21,7 @@ from cosim.core.plugins import build_controller
 from cosim.core.scenario import EstimatorTable, Scenario
 from cosim.core.signals import ahead_of
 from cosim.core.simulation import spawn_seeds
-from cosim.plant.fmi import UnpackedFmu, unpack
+from cosim.plant.fmi import unpack
 from cosim.plant.wiring import start_values
 from fmus.build import build_model, sampled_table
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
@@ -30,10 +30,22 @@ from fmus.ssp import write_ssp
 RECORD = "extra/org.rti-cosim/controller.json"
 
 
-def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()) -> RtiNmpc:
-    """The controller `name`, whose θ ends with the `measured` disturbances of its model.
+def rti_controller(
+    name: str,
+    scenario: Scenario,
+    measured: tuple[str, ...] = (),
+) -> RtiNmpc:
+    """An RTI-NMPC, whose θ ends with the disturbances of its model that are measured.
 
-    Raises ControllerLookupError where it is no RTI-NMPC, ModelError on a name that the model lacks.
+    Args:
+        name: what `build_controller` takes.
+        scenario: what it controls.
+        measured: names of disturbances of its model that are inputs of the exported controller.
+
+    Raises:
+        ControllerLookupError: it is no RTI-NMPC, or the scenario has sensors, too, and their
+            estimator cannot be told what is measured.
+        ModelError: the model lacks a name.
     """
     if scenario.sensors and measured:
         raise ControllerLookupError(
@@ -57,104 +69,80 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
     # A measured disturbance is a parameter of the model, and as such an entry of θ, which the
     # exported controller takes from an input at each sample.
     blocks = ThetaBlocks.from_problem(
-        problem, slack_weights="w_sigma" in before, model_parameters=(*in_theta, *measured)
+        problem,
+        slack_weights="w_sigma" in before,
+        model_parameters=(*in_theta, *measured),
     )
     naive = Parameters.naive(problem, blocks)
-    return RtiNmpc(problem, controller.parameters.placed_in(naive))
+    parameters = controller.parameters.placed_in(naive)
+    return RtiNmpc(problem, parameters)
 
 
 def observer_of(controller: RtiNmpc, scenario: Scenario) -> Observer | None:
     """What makes the state of the readings of the scenario's sensors; None without sensors.
 
     Args:
-        controller: Whose θ may have the filter's variances.
-        scenario: Says which estimator it is.
+        controller: whose θ may have the filter's variances.
+        scenario: says which estimator it is.
 
     Raises:
-        ControllerLookupError: The estimator is another one than `ekf`.
+        ControllerLookupError: the estimator is another one than `ekf`.
     """
     if not scenario.sensors:
         return None
-    kind = (scenario.estimator or EstimatorTable()).kind
-    if kind != "ekf":
+    table = scenario.estimator or EstimatorTable()
+    if table.kind != "ekf":
         raise ControllerLookupError(
-            f"scenario '{scenario.name}': an estimator of kind '{kind}' cannot be exported: take "
-            "estimator.kind 'ekf', or a scenario without [[sensor]]"
+            f"scenario '{scenario.name}': an estimator of kind '{table.kind}' cannot be exported: "
+            "take estimator.kind 'ekf', or a scenario without [[sensor]]"
         )
     estimator = OutputFeedback.from_scenario(scenario, controller).estimator
     assert isinstance(estimator, ExtendedKalmanFilter)
+    # The filter has the logarithms of its variances.
+    variances = np.exp(estimator.noise)
     in_theta = "noise" in controller.parameters.blocks
-    return estimated_state(estimator.model, np.exp(estimator.noise), in_theta=in_theta)
+    return estimated_state(estimator.model, variances, in_theta=in_theta)
 
 
 def sampled_controller(
-    controller: RtiNmpc, scenario: Scenario, measured: tuple[str, ...] = ()
+    controller: RtiNmpc,
+    scenario: Scenario,
+    measured: tuple[str, ...] = (),
 ) -> FmuModel:
-    """The controller as a sampled system; raises ControllerError where it cannot be exported.
+    """The controller as a sampled system.
 
-    Its signals have the names and units of the plant's variables; `measured` is what
-    `rti_controller` was given.
+    Args:
+        controller: what `rti_controller` has made.
+        scenario: what it controls; its signals have the names and units of the plant's variables.
+        measured: what `rti_controller` was given.
+
+    Raises:
+        ControllerError: it cannot be exported.
     """
-    plant = unpack(scenario.plant.fmu)
     hessian = scenario.controller.hessian
-    origin = f"{scenario.hash} {hessian} {controller.parameters.hash}"
     problem = controller.problem
     parameters = controller.parameters
-    blocks = parameters.blocks
     observer = observer_of(controller, scenario)
     exported = core(problem, parameters, hessian, observer, known_counts(scenario))
-    states = scenario.plant.states
-    actions = scenario.plant.actions
-    # Before anything is connected the controller sees its reference.
-    reference = (*problem.reference_state.tolist(), *problem.reference_action.tolist())
-    start = dict(zip((*states, *actions), reference, strict=True))
-
-    def signal(kind: Kind, name: str, about: str, variable: str, **more: Any) -> Variable:
-        """A signal with the unit of a variable of the plant."""
-        unit = plant.unit(variable)
-        return Variable(name, kind, unit=unit, description=about, **more)
-
     # The order is that of the C's arrays: inputs, outputs, predictions, θ.
     if observer is None:
-        signals = [signal(Kind.INPUT, x, "measured state", x, start=start[x]) for x in states]
+        signals = _state_signals(scenario, problem)
     else:
-        signals = _readings(scenario, problem, plant)
-    signals += _known(scenario, problem, plant)
-    about = "whether the actions are those of manual_…, as of the next sample"
-    signals.append(
-        Variable("manual", Kind.INPUT, Type.BOOLEAN, start=0.0, min=0.0, max=1.0, description=about)
-    )
-    about = "action in manual; acts within the bounds of the action"
-    signals += [signal(Kind.INPUT, f"manual_{u}", about, u, start=start[u]) for u in actions]
-    about = "measured disturbance, held over the horizon; not a number: that of theta.p instead"
-    theta = dict(zip(blocks.labels, parameters.theta.tolist(), strict=True))
-    signals += [signal(Kind.INPUT, d, about, d, start=theta[f"p[{d}]"]) for d in measured]
-    for u in actions:
-        low, high = scenario.limits[u]
-        signals.append(signal(Kind.OUTPUT, u, "action, within its bounds", u, min=low, max=high))
-    codes = ", ".join(f"{code} {text}" for code, text in enumerate(STATUSES))
-    reports = {
-        "value": "value V(s) of the state, in manual Q(s, a)",
-        "qp_status": f"of the present sample: {codes}",
-        "kkt_residual": "largest KKT residual of the last QP that was solved",
-        "qp_iterations": "steps of the QP solver in the last QP that was solved",
-        "failures": "samples without a solution so far; they hold the last or manual action",
-    }
-    signals += [Variable(name, Kind.OUTPUT, description=text) for name, text in reports.items()]
-    # No action follows the last predicted state.
-    for names, stages in ((states, problem.horizon + 1), (actions, problem.horizon)):
-        for k in range(stages):
-            for name in names:
-                about = f"predicted {name}, {k} samples ahead"
-                signals.append(signal(Kind.OUTPUT, f"predicted.{name}[{k}]", about, name))
+        signals = _reading_signals(scenario, problem)
+    signals += _known_signals(scenario, problem)
+    signals += _manual_signals(scenario, problem)
+    signals += _disturbance_signals(scenario, parameters, measured)
+    signals += _output_signals(scenario)
+    signals += _prediction_signals(scenario, problem.horizon)
     if observer is not None:
-        signals += _estimates(scenario, problem, observer, plant)
-    meanings = [block.meaning for block in blocks for _ in range(block.size)]
-    signals += [
-        Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
-        for (label, value), about in zip(theta.items(), meanings, strict=True)
-    ]
+        signals += _estimate_signals(scenario, problem, observer)
+    signals += _theta_signals(parameters)
+    terminal = (*scenario.plant.states, *scenario.plant.actions)
+    # The terminal is that of a plant whose states are measured as they are.
+    if observer is not None:
+        terminal = ()
     # Another controller has another name in C, so that both may be linked into one program.
+    origin = f"{scenario.hash} {hessian} {parameters.hash}"
     digest = hashlib.sha256(origin.encode()).hexdigest()
     return FmuModel(
         name=f"RTI-NMPC {scenario.name}",
@@ -167,9 +155,65 @@ def sampled_controller(
         step_size=scenario.sampling_time,
         sampled=True,
         sources=exported.sources,
-        # The terminal is that of a plant whose states are measured as they are.
-        terminal=(*states, *actions) if observer is None else (),
+        terminal=terminal,
     )
+
+
+def _state_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
+    """The measured states, inputs of the controller."""
+    plant = unpack(scenario.plant.fmu)
+    signals = []
+    # Before anything is connected the controller sees its reference.
+    for name, value in zip(scenario.plant.states, problem.reference_state.tolist(), strict=True):
+        state = Variable(
+            name,
+            Kind.INPUT,
+            unit=plant.unit(name),
+            start=value,
+            description="measured state",
+        )
+        signals.append(state)
+    return signals
+
+
+def _reading_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
+    """The readings, and whether each of them is fresh.
+
+    Scalars in FMI 3.0 too: an array has one unit for all of its elements.
+    """
+    plant = unpack(scenario.plant.fmu)
+    sensors = scenario.sensors or ()
+    # Before anything is connected the sensors show what they do at the reference.
+    output = measured_outputs(problem, sensors)
+    output.inputs["z"][:] = problem.reference_state
+    output()
+    values = output.part("y").tolist()
+    readings = []
+    fresh = []
+    for sensor, value in zip(sensors, values, strict=True):
+        name = f"y_{sensor.variable}"
+        meaning = f"reading of {sensor.variable}"
+        if sensor.delay:
+            meaning += f", taken {sensor.delay} samples ago"
+        reading = Variable(
+            name,
+            Kind.INPUT,
+            unit=plant.unit(sensor.variable),
+            start=value,
+            description=meaning,
+        )
+        is_fresh = Variable(
+            f"{name}_fresh",
+            Kind.INPUT,
+            Type.BOOLEAN,
+            start=0.0,
+            min=0.0,
+            max=1.0,
+            description=f"whether {name} is a new reading, to be taken up at the present sample",
+        )
+        readings.append(reading)
+        fresh.append(is_fresh)
+    return [*readings, *fresh]
 
 
 def known_counts(scenario: Scenario) -> tuple[int, ...]:
@@ -181,94 +225,219 @@ def known_counts(scenario: Scenario) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def _known(scenario: Scenario, problem: Problem, plant: UnpackedFmu) -> list[Variable]:
+def _known_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
     """What is known of each signal: its present value or, of a preview, an array of them."""
+    plant = unpack(scenario.plant.fmu)
     tables = {table.name: table for table in scenario.signals or ()}
-    inputs = []
+    signals = []
     for item, count in zip(problem.varying, known_counts(scenario), strict=True):
         table = tables[item.signal]
+        # A price has no unit of the plant's.
         variable = table.bounded_state if table.bound is not None else table.reference
         unit = plant.unit(variable) if variable else ""
         for k in range(count):
-            name = f"signal.{item.signal}" + (f"[{k}]" if count > 1 else "")
-            about = f"known value of {item.signal}, {k} samples ahead"
-            inputs.append(
-                Variable(name, Kind.INPUT, unit=unit, start=item.nominal, description=about)
-            )
-    return inputs
-
-
-def _readings(scenario: Scenario, problem: Problem, plant: UnpackedFmu) -> list[Variable]:
-    """The readings, and whether each of them is fresh.
-
-    Scalars in FMI 3.0 too: an array has one unit for all of its elements.
-    """
-    sensors = scenario.sensors or ()
-    output = measured_outputs(problem, sensors)
-    output.inputs["z"][:] = problem.reference_state
-    output()
-    values = output.part("y").tolist()
-    readings = []
-    fresh = []
-    for sensor, value in zip(sensors, values, strict=True):
-        name = f"y_{sensor.variable}"
-        about = f"reading of {sensor.variable}"
-        if sensor.delay:
-            about += f", taken {sensor.delay} samples ago"
-        unit = plant.unit(sensor.variable)
-        readings.append(Variable(name, Kind.INPUT, unit=unit, start=value, description=about))
-        about = f"whether {name} is a new reading, to be taken up at the present sample"
-        fresh.append(
-            Variable(
-                f"{name}_fresh",
+            name = f"signal.{item.signal}"
+            if count > 1:
+                name += f"[{k}]"
+            value = Variable(
+                name,
                 Kind.INPUT,
-                Type.BOOLEAN,
-                start=0.0,
-                min=0.0,
-                max=1.0,
-                description=about,
+                unit=unit,
+                start=item.nominal,
+                description=f"known value of {item.signal}, {k} samples ahead",
             )
-        )
-    return [*readings, *fresh]
+            signals.append(value)
+    return signals
 
 
-def _estimates(
-    scenario: Scenario, problem: Problem, observer: Observer, plant: UnpackedFmu
-) -> list[Variable]:
+def _estimate_signals(scenario: Scenario, problem: Problem, observer: Observer) -> list[Variable]:
     """The estimates of the state, and of the parameters that the model calls uncertain."""
+    plant = unpack(scenario.plant.fmu)
     states = scenario.plant.states
-    outputs = []
+    signals = []
     for name in states:
-        about = f"estimate of {name} at the present sample"
-        unit = plant.unit(name)
-        outputs.append(Variable(f"estimated.{name}", Kind.OUTPUT, unit=unit, description=about))
-    for name in problem.model.uncertain[: observer.estimates - len(states)]:
-        about = f"estimate of the model's parameter {name}"
-        outputs.append(Variable(f"estimated.{name}", Kind.OUTPUT, description=about))
-    return outputs
+        estimate = Variable(
+            f"estimated.{name}",
+            Kind.OUTPUT,
+            unit=plant.unit(name),
+            description=f"estimate of {name} at the present sample",
+        )
+        signals.append(estimate)
+    n_parameters = observer.estimates - len(states)
+    for name in problem.model.uncertain[:n_parameters]:
+        estimate = Variable(
+            f"estimated.{name}",
+            Kind.OUTPUT,
+            description=f"estimate of the model's parameter {name}",
+        )
+        signals.append(estimate)
+    return signals
+
+
+def _manual_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
+    """What takes the controller's place: a switch, and an action of each kind."""
+    plant = unpack(scenario.plant.fmu)
+    # Off where a tool connects nothing to it.
+    manual = Variable(
+        "manual",
+        Kind.INPUT,
+        Type.BOOLEAN,
+        start=0.0,
+        min=0.0,
+        max=1.0,
+        description="whether the actions are those of manual_…, as of the next sample",
+    )
+    signals = [manual]
+    for name, value in zip(scenario.plant.actions, problem.reference_action.tolist(), strict=True):
+        action = Variable(
+            f"manual_{name}",
+            Kind.INPUT,
+            unit=plant.unit(name),
+            start=value,
+            description="action in manual; acts within the bounds of the action",
+        )
+        signals.append(action)
+    return signals
+
+
+def _disturbance_signals(
+    scenario: Scenario,
+    parameters: Parameters,
+    measured: tuple[str, ...],
+) -> list[Variable]:
+    """The measured disturbances, inputs of the controller that start at their values in θ."""
+    plant = unpack(scenario.plant.fmu)
+    theta = _values_by_label(parameters)
+    signals = []
+    for name in measured:
+        disturbance = Variable(
+            name,
+            Kind.INPUT,
+            unit=plant.unit(name),
+            start=theta[f"p[{name}]"],
+            description="measured disturbance, held over the horizon; "
+            "not a number: that of theta.p instead",
+        )
+        signals.append(disturbance)
+    return signals
+
+
+def _output_signals(scenario: Scenario) -> list[Variable]:
+    """The actions, and what the controller reports of a sample."""
+    plant = unpack(scenario.plant.fmu)
+    signals = []
+    for name in scenario.plant.actions:
+        low, high = scenario.limits[name]
+        action = Variable(
+            name,
+            Kind.OUTPUT,
+            unit=plant.unit(name),
+            min=low,
+            max=high,
+            description="action, within its bounds",
+        )
+        signals.append(action)
+    codes = ", ".join(f"{code} {text}" for code, text in enumerate(STATUSES))
+    reports = {
+        "value": "value V(s) of the state, in manual Q(s, a)",
+        "qp_status": f"of the present sample: {codes}",
+        "kkt_residual": "largest KKT residual of the last QP that was solved",
+        "qp_iterations": "steps of the QP solver in the last QP that was solved",
+        "failures": "samples without a solution so far; they hold the last or manual action",
+    }
+    for name, text in reports.items():
+        signals.append(Variable(name, Kind.OUTPUT, description=text))
+    return signals
+
+
+def _prediction_signals(scenario: Scenario, horizon: int) -> list[Variable]:
+    """States and actions over the horizon, stage by stage."""
+    plant = unpack(scenario.plant.fmu)
+    signals = []
+    # No action follows the last predicted state.
+    predicted = (
+        (scenario.plant.states, horizon + 1),
+        (scenario.plant.actions, horizon),
+    )
+    for names, stages in predicted:
+        for k in range(stages):
+            for name in names:
+                prediction = Variable(
+                    f"predicted.{name}[{k}]",
+                    Kind.OUTPUT,
+                    unit=plant.unit(name),
+                    description=f"predicted {name}, {k} samples ahead",
+                )
+                signals.append(prediction)
+    return signals
+
+
+def _theta_signals(parameters: Parameters) -> list[Variable]:
+    """The entries of θ, which are tunable: another θ may be set where the FMU runs."""
+    meanings = []
+    for block in parameters.blocks:
+        meanings += [block.meaning] * block.size
+    values = _values_by_label(parameters)
+    signals = []
+    for (label, value), meaning in zip(values.items(), meanings, strict=True):
+        entry = Variable(
+            f"theta.{_structured(label)}",
+            Kind.TUNABLE,
+            start=value,
+            description=meaning,
+        )
+        signals.append(entry)
+    return signals
+
+
+def _values_by_label(parameters: Parameters) -> dict[str, float]:
+    """θ by the labels of its entries."""
+    values = parameters.theta.tolist()
+    return dict(zip(parameters.blocks.labels, values, strict=True))
 
 
 def write_c(
-    controller: RtiNmpc, scenario: Scenario, folder: Path, single: bool = False
+    controller: RtiNmpc,
+    scenario: Scenario,
+    folder: Path,
+    single: bool = False,
 ) -> dict[str, Any]:
-    """Write the controller as C into `folder`, whose name its functions begin with."""
+    """Write a controller as C.
+
+    Args:
+        controller: what `rti_controller` has made.
+        scenario: what it controls.
+        folder: for the files; the functions begin with its name.
+        single: whether the numbers are floats of 32 bits.
+
+    Returns:
+        The folder, the names of its files, and the name that the functions begin with.
+    """
     observer = observer_of(controller, scenario)
     if single and observer is not None:
         raise ControllerLookupError(
             f"scenario '{scenario.name}' has sensors, and single precision does not carry the "
             "covariance of their estimator: leave --single out"
         )
-    hessian = scenario.controller.hessian
     exported = core(
-        controller.problem, controller.parameters, hessian, observer, known_counts(scenario)
+        controller.problem,
+        controller.parameters,
+        scenario.controller.hessian,
+        observer,
+        known_counts(scenario),
     )
     # A folder's name may hold what no C identifier does.
-    name = re.sub(r"\W", "_", folder.absolute().name)
+    folder_name = folder.absolute().name
+    name = re.sub(r"\W", "_", folder_name)
     files = plain_c(exported, name, scenario, single=single)
     folder.mkdir(exist_ok=True)
     for file, text in files.items():
         write_atomically(folder / file, text)
-    return {"folder": str(folder), "files": list(files), "name": name}
+    return {
+        "folder": str(folder),
+        "files": list(files),
+        "name": name,
+    }
 
 
 def _structured(label: str) -> str:
@@ -291,13 +460,31 @@ def write_fmu(
     measured: tuple[str, ...] = (),
     every_platform: bool = False,
 ) -> Path:
-    """Write the FMU of `sampled_controller` with a record of its scenario and θ."""
+    """Write the FMU of `sampled_controller` with a record of its scenario and θ.
+
+    Args:
+        controller: what `rti_controller` has made.
+        scenario: what it controls.
+        target: path of the FMU.
+        version: major version of FMI.
+        measured: what `rti_controller` was given.
+        every_platform: build for each of `fmus.PLATFORMS`, and not for the platform at hand alone.
+
+    Returns:
+        The path of the FMU.
+
+    Raises:
+        ControllerError: the controller cannot be exported.
+        BuildError: there is no compiler, or it refuses the C.
+    """
     system = sampled_controller(controller, scenario, measured)
     labels = controller.parameters.blocks.labels
+    values = controller.theta.tolist()
+    # Whoever finds the FMU can tell what it was made of, and make it again.
     record = {
         "scenario": scenario.to_dict(),
         "scenario_hash": scenario.hash,
-        "theta": dict(zip(labels, controller.theta.tolist(), strict=True)),
+        "theta": dict(zip(labels, values, strict=True)),
         "theta_hash": controller.parameters.hash,
     }
     text = json.dumps(record, indent=2, default=repr) + "\n"
@@ -311,20 +498,39 @@ def write_fmu(
 
 
 def write_loop(
-    controller: Path, scenario: Scenario, seed: int, target: Path, measured: tuple[str, ...] = ()
+    controller: Path,
+    scenario: Scenario,
+    seed: int,
+    target: Path,
+    measured: tuple[str, ...] = (),
 ) -> Path:
     """Write an SSP with the same trajectory as `cosim simulate --seed`, unless it has `measured`.
 
     The controller comes first: it acts on the state at the sample, then the plant takes the step.
     Where the plant can, its inputs saturate, as the loop of `simulate` does it, so that a master
     may begin before any action has come.
-    Raises PlantError where the plant does not fit the scenario.
+
+    Args:
+        controller: path of its FMU.
+        scenario: what it controls.
+        seed: of the run, as `cosim simulate` takes it.
+        target: path of the SSP.
+        measured: disturbances that the plant gives to the controller.
+
+    Returns:
+        The path of the SSP.
+
+    Raises:
+        PlantError: the plant does not fit the scenario.
     """
     plant = scenario.plant
     plant_seed, _ = spawn_seeds(seed)
     starts = start_values(scenario, plant_seed)
     archive = unpack(plant.fmu)
-    types = {name: variable.type for name, variable in archive.variables.items()}
+    types = {}
+    for name, variable in archive.variables.items():
+        types[name] = variable.type
+    # A switch of our own plants, off by default: an input beyond its range is then refused.
     if "saturate" in types:
         starts["saturate"] = ("Boolean", 1.0)
     for name, (kind, value) in list(starts.items()):

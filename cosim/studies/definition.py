@@ -226,7 +226,7 @@ class Study:
             **point.fields,
             settings=point.settings,
             training=dict(table.training),
-            training_seeds=_numbers(seeds),
+            training_seeds=_seed_numbers(seeds),
             against=table.against,
         )
 
@@ -444,7 +444,7 @@ def _name_of_controller(source: str) -> str:
     return source.replace(":", ".")
 
 
-def _numbers(seeds: SeedsTable) -> tuple[int, ...]:
+def _seed_numbers(seeds: SeedsTable) -> tuple[int, ...]:
     """The training seeds of a table."""
     return tuple(range(seeds.first, seeds.first + seeds.count))
 

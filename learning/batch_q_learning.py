@@ -17,7 +17,7 @@ from learning.algorithm import Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Count
 from learning.errors import DivergenceError
-from learning.q_learning import ValueConfiguration, ValueRule
+from learning.q_learning import ValueConfiguration, ValueRule, redundancy_of
 from learning.step import Fit
 
 
@@ -49,6 +49,8 @@ class BatchQLearning(ValueRule):
     At γ = 1 both δ and ∇Q are those less their means over the batch: a fit with an intercept.
     This is done `relinearisations` times a batch, each at the θ of the last step: the iterated
     filter (Gauss–Newton on the posterior). The first batch also gives noise, widths and c_f.
+    r is the noise of a sample times the samples that say as much as an independent one
+    (`redundancy_of`).
     """
 
     learns_from_estimates = True
@@ -60,6 +62,7 @@ class BatchQLearning(ValueRule):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._variance = 0.0  # r; zero until the first batch is full
+        self._redundancy = 1.0  # samples that say as much as an independent one
         longest = max(self._length, self.configuration.batch_size)
         self._buffer = ReplayBuffer(self.controller, longest)
         self._start = self.controller.theta.copy()  # θ₀
@@ -140,8 +143,9 @@ class BatchQLearning(ValueRule):
         """
         settings = self.configuration
         prior = self._information
-        variance = self._variance
-        limit = settings.innovation_clip * variance**0.5
+        limit = settings.innovation_clip * self._variance**0.5
+        # Noise that lasts tells the same again: the fit takes each sample for less.
+        variance = self._redundancy * self._variance
         # As online: no single sample decides.
         innovation = np.clip(td_error, -limit, limit)
         of_batch = gradient.T @ gradient / variance
@@ -177,6 +181,8 @@ class BatchQLearning(ValueRule):
         self._variance = max(mean_square, np.finfo(np.float64).tiny)
         states = self._buffer.column("s")
         errors = self._buffer.column("error")
+        doubt = self.configuration.persistence_doubt
+        self._redundancy = redundancy_of(states, errors, doubt)
         start = self._begin_with_prior(states, errors, self._variance**0.5)
         self.controller.theta = start.theta
         self._start = start.theta.copy()
@@ -195,6 +201,7 @@ class BatchQLearning(ValueRule):
             "information": self._information,
             "mean": self._mean,
             "variance": self._variance,
+            "redundancy": self._redundancy,
         }
 
     def load_state_dict(self, state: State) -> None:
@@ -205,6 +212,7 @@ class BatchQLearning(ValueRule):
         self._information = state["information"]
         self._mean = state["mean"]
         self._variance = state["variance"]
+        self._redundancy = state["redundancy"]
 
 
 class Replayed(NamedTuple):

@@ -194,3 +194,23 @@ def test_only_the_expected_penalty_of_the_next_state_counts(collected, scenario,
     before = theta_after(collected, scenario, problem, as_it_was, {})
     after = theta_after(collected, scenario, problem, moved_into_the_next_penalty, {})
     assert after == pytest.approx(before, rel=1e-9, abs=1e-9)
+
+
+def test_errors_that_last_count_for_less(collected, scenario, problem):
+    """Where the warm-up's errors are correlated in time, a batch moves θ by a shorter step."""
+    _, samples = collected
+
+    def step_with(doubt):
+        settings = {"batch_size": 60, "relinearisations": 1, "persistence_doubt": doubt}
+        configuration = BatchQLearning.Configuration.from_dict(settings)
+        controller = RtiNmpc(problem, starting_parameters(problem, configuration))
+        with FmuPlant(scenario) as plant:
+            algorithm = looped(
+                BatchQLearning, plant, controller, configuration, 60, seed=5
+            ).algorithm
+        for number, sample in enumerate(samples):
+            lasting = np.array([1.0, 3.0]) * np.sin(number / 4)
+            update = algorithm.observe(sample._replace(next_s=sample.next_s + lasting))
+        return update.step
+
+    assert 0 < step_with(4.0) < 0.9 * step_with(1e9)

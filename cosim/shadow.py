@@ -134,15 +134,19 @@ class Shadow(Result):
 
     def runs(self) -> dict[str, RunSignals]:
         """The log and the controller as two runs, for a recording of one over the other."""
-        runs = {}
-        for name, actions in (("logged", self.logged), (self.controller, self.proposed)):
-            signals = {"time": Signal("time", "s", self.time)}
-            for given, column in zip(self.given_names, self.given.T, strict=True):
-                signals[given] = Signal(given, "", column)
-            for action, column in zip(self.scenario.plant.actions, actions.T, strict=True):
-                signals[action] = Signal(action, "", column)
-            runs[name] = RunSignals(name, signals, self.status, self.scenario.limits)
-        return runs
+        return {
+            "logged": self._run("logged", self.logged),
+            self.controller: self._run(self.controller, self.proposed),
+        }
+
+    def _run(self, name: str, actions: Array) -> RunSignals:
+        """What was given and these actions, (K, m), as a run of that name."""
+        signals = {"time": Signal("time", "s", self.time)}
+        for i, given in enumerate(self.given_names):
+            signals[given] = Signal(given, "", self.given[:, i])
+        for i, action in enumerate(self.scenario.plant.actions):
+            signals[action] = Signal(action, "", actions[:, i])
+        return RunSignals(name, signals, self.status, self.scenario.limits)
 
     def figure(self) -> Figure:
         """Each action as logged and as proposed over time, above what the controller was given."""

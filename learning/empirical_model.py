@@ -41,8 +41,6 @@ Rows = NDArray[np.intp]
 """Numbers of samples."""
 INTEGRATION_ERROR = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
-DRAW_ROUNDS = 3
-"""Gauss-Newton steps to a model that is drawn from the posterior."""
 BLOCK = 250
 """Rows of the fit that are factored at a time: as many as fit in a processor's cache."""
 
@@ -560,6 +558,7 @@ class EmpiricalModel:
         count: int,
         rng: np.random.Generator,
         follows: NDArray[np.bool_] | None = None,
+        rounds: int = 3,
     ) -> list[EmpiricalModel]:
         """Models from the posterior: each is a fit to outputs and a prior that are moved by chance.
 
@@ -575,6 +574,7 @@ class EmpiricalModel:
             count: number of models.
             rng: draws what data and prior are moved by.
             follows: as in `fit`.
+            rounds: Gauss-Newton steps to each model.
         """
         regression = _Regression(self.features, inputs, outputs, settings, follows)
         y, _, _ = self.features(inputs, np.zeros(self.features.n_parameters))
@@ -593,7 +593,7 @@ class EmpiricalModel:
             moved = rng.multivariate_normal(np.zeros(len(noise)), noise, len(target))
             centre = prior * rng.standard_normal(prior.size)
             mean = self.mean
-            for _ in range(DRAW_ROUNDS):
+            for _ in range(rounds):
                 design, target = regression.equations(mean[:p], 1, self.persistence)
                 # About its moved centre the prior is the usual one.
                 about_centre = target + moved - design @ centre

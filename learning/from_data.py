@@ -1,25 +1,19 @@
 """`train_from_data`: θ from a plant's log alone; no plant is stepped.
 
 The empirical model is fitted to the logged transitions, and a rule proposes θ: `model-based` by its
-search on that model, `batch-q-learning` by replaying the log. What θ would have cost is then
-predicted on the log's own disturbances: the model's errors are played back in their order, so that
-under the logged actions it repeats the log, and two controllers meet the same. This is done for
-draws from the posterior of the model's coefficients, so that the intervals hold what the log does
-not say of the plant, beside the chance of its disturbances.
+search on that model, `batch-q-learning` by replaying the log. `learning.log_checks` says what of
+the log is used, and `learning.log_prediction` what θ would have cost on its own disturbances.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import stdtrit
 from threadpoolctl import threadpool_limits
 
 from controllers.factories import nmpc
@@ -30,56 +24,24 @@ from cosim.core.logged_data import LoggedData, LoggedDataError, read_logged_data
 from cosim.core.protocols import Array, Step, Vector
 from cosim.core.result import Shown
 from cosim.core.scenario import Scenario
-from cosim.core.statistics import LEVEL, Estimate, shown
+from cosim.core.statistics import Estimate, shown
 from cosim.core.training_options import TrainingOptions
 from learning.algorithm import load_algorithm
 from learning.batch_q_learning import BatchQLearning
 from learning.configuration import Configuration
-from learning.empirical_model import (
-    INTEGRATION_ERROR,
-    EmpiricalModel,
-    EmpiricalModelConfiguration,
-    Features,
-)
+from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
 from learning.errors import ConfigurationError, DivergenceError
 from learning.exploration import Strategy
+from learning.log_checks import inputs_and_outputs, usable
+from learning.log_configuration import LogConfiguration
+from learning.log_prediction import Prediction, difference
 from learning.loop import TrainingLoop
-from learning.model_based import BackOffOnModel, ExpectedCosts, ModelBased, ModelBasedConfiguration
-from learning.plant_data import PlantData
+from learning.model_based import BackOffOnModel, ModelBased, ModelBasedConfiguration
 from learning.rollout import Rollout
 from learning.training_run import TrainingRun, make_run
 
 RULES = ("model-based", "batch-q-learning")
 """Rules that can learn from a log."""
-SHIFTS = (-2, -1, 1, 2)
-"""Rows by which the inputs may be logged early or late, to be looked for."""
-EVIDENCE = 10.0
-"""Nats by which the log must speak for another reading of itself to be refused."""
-UNLIKE = 5.0
-"""Times that the nominal model may err as much as "nothing changes" does, before it is no model."""
-BIASED = 0.5
-"""Mean error that it must have for that, over h: as of disturbances half their magnitude off."""
-JUMP = 10.0
-"""Standard deviations, by the median, from which on an error is a jump."""
-JUMP_BACK = 4.0
-"""Standard deviations from which on an error after a jump may be the one back."""
-ALIKE = 1.3
-"""Largest ratio of the two jumps."""
-DROPOUT = 10
-"""Most rows from a jump to the one back."""
-DRAWS = 24
-"""Models that are drawn from the posterior."""
-BLOCKS = (16, 8)
-"""Numbers of stretches of the log by whose spread the chance of disturbances is told."""
-LOST = 1e6
-"""Times the largest cost of the log beyond which a rollout has run away."""
-COST_NOISE = 1e-4
-"""Size of the noise that a cost gets which is the model's own, as a share of its mean."""
-SETTLING = 300
-"""Samples of a rollout, and of the log, before they count: a quarter of the log at most."""
-HARDLY_SHOWN = 0.5
-"""Share of the prior variance of a parameter left by the log from which on it does not show it."""
-
 LogVerdict = Literal["better", "cannot tell"]
 
 
@@ -105,6 +67,7 @@ class TrainingFromData(Shown):
 
     Attributes:
         run: the training's rule, scenario, settings and start.
+        log_settings: what of the log was refused or left out, and how θ was judged.
         data: the transitions that were used, and what was left out.
         start: the first θ.
         learned: the θ that the rule proposes.
@@ -128,6 +91,7 @@ class TrainingFromData(Shown):
     """
 
     run: TrainingRun
+    log_settings: LogConfiguration
     data: LoggedData
     start: Parameters
     learned: Parameters
@@ -149,8 +113,8 @@ class TrainingFromData(Shown):
     @property
     def verdict(self) -> LogVerdict:
         """`better` where the learned θ is shown to cost less than the log and than the start."""
-        for difference in (self.against_logged, self.against_start):
-            if difference.interval is None or not difference.interval[1] < 0:
+        for estimate in (self.against_logged, self.against_start):
+            if not _upper_end(estimate) < 0:
                 return "cannot tell"
         return "better"
 
@@ -211,9 +175,9 @@ class TrainingFromData(Shown):
             known.append(parameter._asdict())
         differences: dict[str, Any] = {}
         for name in ("against_logged", "against_start", "start_against_logged"):
-            difference: Estimate = getattr(self, name)
-            differences[name] = difference.value
-            differences[f"{name}_interval"] = difference.interval
+            estimate: Estimate = getattr(self, name)
+            differences[name] = estimate.value
+            differences[f"{name}_interval"] = estimate.interval
         return {
             "algorithm": self.run.algorithm,
             "scenario": self.run.scenario.name,
@@ -221,6 +185,7 @@ class TrainingFromData(Shown):
             "start": self.run.start,
             "seed": self.run.seed,
             "hyperparameters": self.run.configuration.model_dump(mode="json"),
+            "log_settings": self.log_settings.model_dump(mode="json"),
             "rows": self.data.rows,
             "transitions": len(self.data),
             "left_out": dict(self.data.left_out),
@@ -252,6 +217,7 @@ def train_from_data(
     seed: int = 0,
     controller: str = "rti",
     settings: Mapping[str, Any] | Configuration | None = None,
+    log_settings: Mapping[str, Any] | LogConfiguration | None = None,
     columns: Mapping[str, str] | None = None,
     leave_out: Sequence[str] = (),
 ) -> TrainingFromData:
@@ -265,6 +231,8 @@ def train_from_data(
         seed: of the search's noise and of the models drawn.
         controller: what carries θ, rti or converged.
         settings: hyperparameters by name; the algorithm's Configuration documents them.
+        log_settings: what of a log is refused, left out or believed, by name; LogConfiguration
+            documents it.
         columns: the file's name of a column by ours, where they differ.
         leave_out: `COLUMN=VALUE` each: rows that are left out.
 
@@ -280,6 +248,7 @@ def train_from_data(
         controller=controller,
         evaluation_seeds=0,
     )
+    checked_settings = LogConfiguration.of(log_settings)
     run = make_run(algorithm, scenario, 1, settings, options)
     _check_run(run)
     problem = Problem.from_scenario(scenario)
@@ -293,7 +262,7 @@ def train_from_data(
         )
     # The rules' matrices are small: BLAS's second thread spins for longer than it computes.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _train(run, problem, data)
+        return _train(run, checked_settings, problem, data)
 
 
 def units_of(problem: Problem) -> dict[str, str]:
@@ -316,7 +285,12 @@ def _check_run(run: TrainingRun) -> None:
             )
 
 
-def _train(run: TrainingRun, problem: Problem, data: LoggedData) -> TrainingFromData:
+def _train(
+    run: TrainingRun,
+    log_settings: LogConfiguration,
+    problem: Problem,
+    data: LoggedData,
+) -> TrainingFromData:
     """Fit, propose θ, and predict what it costs."""
     settings = run.configuration
     if not isinstance(settings, ModelBasedConfiguration):
@@ -324,8 +298,8 @@ def _train(run: TrainingRun, problem: Problem, data: LoggedData) -> TrainingFrom
     cost_is_modelled = data.stage_cost is None
     plant_problem = _with_nominal_cost(problem) if cost_is_modelled else problem
     features = Features(plant_problem, settings.smallest_error_size)
-    data = usable(data, run.scenario, features, settings)
-    inputs, outputs = _table(data, features)
+    data = usable(data, run.scenario, features, settings, log_settings)
+    inputs, outputs = inputs_and_outputs(data, features)
     model = _fitted(features, inputs, outputs, data, settings)
     start = run.starting_parameters()
     rollout = Rollout(problem, start, features)
@@ -342,7 +316,7 @@ def _train(run: TrainingRun, problem: Problem, data: LoggedData) -> TrainingFrom
     except DivergenceError as error:
         status = f"diverged: {error}"
 
-    prediction = _Prediction(
+    prediction = Prediction(
         problem,
         rollout,
         model,
@@ -351,25 +325,31 @@ def _train(run: TrainingRun, problem: Problem, data: LoggedData) -> TrainingFrom
         settings,
         data.follows,
     )
-    draws = prediction.draws([theta, start.theta], rng)
-    of_learned = draws.costs[0]
-    of_start = draws.costs[1]
+    costs = prediction.costs([theta, start.theta], log_settings.drawn_models, rng)
+    of_learned, of_start = costs.thetas
     realised = outputs[:, -1] + run.scenario.state_penalty.along(data.states)
-    against_start, share_against_start = difference(of_learned, of_start)
-    against_logged, share_against_logged = difference(of_learned, draws.logged)
+    stretches = log_settings.stretches
+    against_start, share_against_start = difference(of_learned, of_start, stretches)
+    against_logged, share_against_logged = difference(of_learned, costs.logged, stretches)
+    start_against_logged, _ = difference(of_start, costs.logged, stretches)
     model_share = share_against_start
     if _upper_end(against_logged) > _upper_end(against_start):
         model_share = share_against_logged
-    start_against_logged, _ = difference(of_start, draws.logged)
-    known, directions_shown = _known_parameters(problem, model, settings)
+    known, directions_shown = _known_parameters(
+        problem,
+        model,
+        settings,
+        log_settings.least_shown,
+    )
     return TrainingFromData(
         run=run,
+        log_settings=log_settings,
         data=data,
         start=start,
         learned=start.with_theta(theta),
         status=status,
         logged_cost=float(realised.mean()),
-        modelled_cost=float(draws.logged.mean()),
+        modelled_cost=float(costs.logged.mean()),
         start_cost=float(of_start.mean()),
         learned_cost=float(of_learned.mean()),
         against_logged=against_logged,
@@ -380,7 +360,7 @@ def _train(run: TrainingRun, problem: Problem, data: LoggedData) -> TrainingFrom
         directions_shown=directions_shown,
         excitation=excitation(data, run.scenario),
         cost_is_modelled=cost_is_modelled,
-        outside=draws.outside,
+        outside=costs.outside,
     )
 
 
@@ -396,221 +376,6 @@ def _with_nominal_cost(problem: Problem) -> Problem:
         return cost(x, u, d, p)
 
     return replace(problem, model=replace(model, economic_cost=nominal))
-
-
-def _table(data: LoggedData, features: Features) -> tuple[Array, Array]:
-    """Inputs (s, a), (M, n+m), and outputs (s₊, ℓ), (M, K), of a log's transitions."""
-    inputs = np.column_stack([data.states, data.actions])
-    stage_cost = data.stage_cost
-    if stage_cost is None:
-        y, _, _ = features(inputs, np.zeros(features.n_parameters))
-        nominal = y[:, -1]
-        # An output without any error has no size, and its rounding would look like one.
-        noise = np.random.default_rng(0).standard_normal(len(nominal))
-        stage_cost = nominal + COST_NOISE * np.abs(nominal).mean() * noise
-    return inputs, np.column_stack([data.next_states, stage_cost])
-
-
-def usable(
-    data: LoggedData,
-    scenario: Scenario,
-    features: Features,
-    settings: EmpiricalModelConfiguration,
-) -> LoggedData:
-    """The transitions that the nominal model can make sense of.
-
-    Refused is a log that speaks for another reading of itself, or of which the model makes nothing;
-    left out are jumps that no plant makes, and data from before a change of the plant.
-
-    Args:
-        data: the transitions.
-        scenario: names the variables.
-        features: the nominal model.
-        settings: how many are remembered, and how a change is told.
-
-    Raises:
-        LoggedDataError: the log is doubtful.
-    """
-    data = data.latest(settings.memory)
-    _check_reading(data, scenario, features)
-    data = data.without(_jumps(data, features), "jump there and back")
-    inputs, outputs = _table(data, features)
-    n_outdated = PlantData(features, settings).outdated(inputs, outputs)
-    before_a_change = np.arange(len(data)) < n_outdated
-    return data.without(before_a_change, "before a change of the plant")
-
-
-def _nominal_errors(
-    features: Features,
-    states: Array,
-    actions: Array,
-    next_states: Array,
-) -> tuple[Array, Array]:
-    """Errors of the nominal model's states over h, and their least deviations, (M, n) each."""
-    n = states.shape[1]
-    inputs = np.column_stack([states, actions])
-    y, _, h = features(inputs, np.zeros(features.n_parameters))
-    sizes = h[:, :n]
-    errors = (next_states - y[:, :n]) / sizes
-    rounding = INTEGRATION_ERROR * np.abs(y[:, :n]) / sizes
-    return errors, rounding
-
-
-def _log_likelihood(errors: Array, rounding: Array) -> float:
-    """Of normal errors (M, n) of mean zero and unknown covariance, but for a constant."""
-    covariance = errors.T @ errors / len(errors)
-    least = np.diag((rounding**2).mean(axis=0))
-    _, logarithm = np.linalg.slogdet(covariance + least)
-    return float(-len(errors) * logarithm / 2)
-
-
-def _gain(reading: tuple[Array, Array], as_it_is: tuple[Array, Array]) -> float:
-    """Nats by which a reading's errors (M, n) are likelier than those of the log as it is."""
-    return _log_likelihood(*reading) - _log_likelihood(*as_it_is)
-
-
-def _centred(reading: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Errors (M, n) less their mean, and the least deviations."""
-    errors, rounding = reading
-    return errors - errors.mean(axis=0), rounding
-
-
-def _check_reading(data: LoggedData, scenario: Scenario, features: Features) -> None:
-    """Refuse a log whose inputs are a row off, whose columns are exchanged, or of another plant.
-
-    Only the nominal model is asked, and only whether it explains the states better when the log is
-    read otherwise. A fitted model would find the controller's own law in inputs of the next row.
-    """
-    plant = scenario.plant
-    # Rows of one unbroken stretch, so that an input may be taken some rows earlier or later.
-    reach = max(SHIFTS)
-    n_rows = len(data)
-    middle = np.arange(reach, n_rows - reach)
-    whole = np.ones(len(middle), bool)
-    for shift in range(1 - reach, reach + 1):
-        whole &= data.follows[middle + shift]
-    rows = middle[whole]
-    if len(rows) < 10 * features.n_outputs:
-        return
-    states = data.states[rows]
-    actions = data.actions[rows]
-    next_states = data.next_states[rows]
-
-    as_it_is = _nominal_errors(features, states, actions, next_states)
-    gains = {}
-    # A shift leaves the mean error as it is, which is the plant's own.
-    for shift in SHIFTS:
-        way = "late" if shift > 0 else "early"
-        words = f"the inputs are logged {abs(shift)} row{'s' * (abs(shift) > 1)} {way}"
-        reading = _nominal_errors(features, states, data.actions[rows + shift], next_states)
-        gains[words] = _gain(_centred(reading), _centred(as_it_is))
-    # Exchanged columns have another mean, and may make the model's states stand still: it counts.
-    for one, other in combinations(range(len(plant.actions)), 2):
-        words = f"columns {plant.actions[one]} and {plant.actions[other]} are exchanged"
-        exchanged = _exchanged(actions, one, other)
-        reading = _nominal_errors(features, states, exchanged, next_states)
-        gains[words] = _gain(reading, as_it_is)
-    for one, other in combinations(range(len(plant.states)), 2):
-        words = f"columns {plant.states[one]} and {plant.states[other]} are exchanged"
-        exchanged = _exchanged(states, one, other)
-        followers = _exchanged(next_states, one, other)
-        reading = _nominal_errors(features, exchanged, actions, followers)
-        gains[words] = _gain(reading, as_it_is)
-    best = max(gains, key=lambda words: gains[words])
-    if gains[best] > EVIDENCE:
-        raise LoggedDataError(
-            f"the log looks as if {best}: the model then explains it better by "
-            f"{gains[best]:.0f} nats; correct the file (a dead time of the plant belongs in the "
-            "model)"
-        )
-
-    # "Nothing changes" is the poorest model; one that is far poorer has other units.
-    errors, _ = as_it_is
-    inputs = np.column_stack([states, actions])
-    y, _, h = features(inputs, np.zeros(features.n_parameters))
-    changes = (next_states - states) / h[:, : states.shape[1]]
-    for i, name in enumerate(plant.states):
-        change = float(np.sqrt(np.mean(changes[:, i] ** 2)))
-        if _is_unlike(errors[:, i], change):
-            raise LoggedDataError(
-                f"the model predicts {name} more than {UNLIKE:g} times worse than that it stays as "
-                "it is: a unit or a column is wrong, or the model is of another plant"
-            )
-    if data.stage_cost is None:
-        return
-    stage_cost = data.stage_cost[rows]
-    cost_errors = (stage_cost - y[:, -1]) / h[:, -1]
-    spread = float(np.std(stage_cost / h[:, -1]))
-    if _is_unlike(cost_errors, spread):
-        raise LoggedDataError(
-            f"the logged stage cost is {stage_cost.mean():.6g} on average, and the model's "
-            f"{y[:, -1].mean():.6g}: another unit, or another cost? Without the column the model's "
-            "is taken"
-        )
-
-
-def _is_unlike(errors: Array, spread: float) -> bool:
-    """Whether a model's errors say that it is of something else, or in another unit.
-
-    Args:
-        errors: over h, (M,).
-        spread: root mean square of what they must be small against, over h.
-    """
-    size = float(np.sqrt(np.mean(errors**2)))
-    is_biased = abs(float(errors.mean())) > BIASED
-    return size > UNLIKE * spread and is_biased
-
-
-def _exchanged(table: Array, one: int, other: int) -> Array:
-    """A table (M, ·) with two columns exchanged."""
-    exchanged = table.copy()
-    exchanged[:, [one, other]] = table[:, [other, one]]
-    return exchanged
-
-
-def _jumps(data: LoggedData, features: Features) -> NDArray[np.bool_]:
-    """Transitions of a reading that leaves the plant's and comes back, (M,): a spike, a dropout.
-
-    A disturbance of the plant, be it as large, does not jump back by itself.
-    """
-    errors, rounding = _nominal_errors(features, data.states, data.actions, data.next_states)
-    distance = errors - np.median(errors, axis=0)
-    # The median's deviation is not moved by the jumps themselves.
-    deviation = 1.4826 * np.median(np.abs(distance), axis=0)
-    deviation = np.maximum(deviation, rounding.mean(axis=0))
-    sizes = np.abs(distance) / deviation
-    changes = data.next_states - data.states
-    jumps = np.zeros(len(data), bool)
-    for size, change in zip(sizes.T, changes.T, strict=True):
-        for there in np.flatnonzero(size > JUMP).tolist():
-            back = _jump_back(there, size, change, data.follows)
-            if back is not None:
-                jumps[there : back + 1] = True
-    return jumps
-
-
-def _jump_back(
-    there: int,
-    size: Array,
-    change: Array,
-    follows: NDArray[np.bool_],
-) -> int | None:
-    """The transition in which a reading that has jumped comes back; None where it stays.
-
-    Args:
-        there: the transition of the jump.
-        size: of the errors of this state, in deviations, (M,).
-        change: of this state in each transition, (M,).
-        follows: whether the transition before ends where this one begins, (M,).
-    """
-    for later in range(there + 1, min(there + 1 + DROPOUT, len(size))):
-        if not follows[later]:
-            return None
-        # The model expects the plant to stay where the jump has led, not to come back.
-        is_error = size[later] > JUMP_BACK
-        if is_error and 1 / ALIKE < -change[later] / change[there] < ALIKE:
-            return later
-    return None
 
 
 def _fitted(
@@ -752,155 +517,6 @@ def _replayed(
     return controller.theta.copy()
 
 
-class _Draws(NamedTuple):
-    """Costs that drawn models predict, D models of the M samples that count.
-
-    Attributes:
-        costs: of each θ, (D, M) each; infinite where a model's rollout is lost.
-        logged: of the logged operation, (D, M).
-        outside: share of the first θ's samples in which a state is where the plant has not been.
-    """
-
-    costs: list[Array]
-    logged: Array
-    outside: float
-
-
-class _Prediction:
-    """Predicts what θ would have cost on the disturbances of a log.
-
-    Args:
-        problem: has the penalty.
-        rollout: of the problem's controller.
-        model: the estimate from the log.
-        inputs: (s, a), (M, n+m).
-        outputs: (s₊, ℓ), (M, K).
-        settings: of the fit and of the expected penalty.
-        follows: whether each transition begins where the one before ends, (M,).
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        rollout: Rollout,
-        model: EmpiricalModel,
-        inputs: Array,
-        outputs: Array,
-        settings: ModelBasedConfiguration,
-        follows: NDArray[np.bool_],
-    ) -> None:
-        self._problem = problem
-        self._rollout = rollout
-        self._model = model
-        self._follows = follows
-        self._inputs = inputs
-        self._outputs = outputs
-        self._settings = settings
-
-    def draws(self, thetas: Sequence[Vector], rng: np.random.Generator) -> _Draws:
-        """Costs of θ, (n_θ,) each, and of the log, by models drawn from the posterior."""
-        # All begin at the log's first state, and count once they have settled.
-        count = len(self._inputs)
-        settling = min(SETTLING, count // 4)
-        picks = np.arange(count, dtype=np.int32)
-        start = self._inputs[0, : self._problem.n_states]
-        costs = [np.full((DRAWS, count - settling), np.inf) for _ in thetas]
-        logged = np.empty((DRAWS, count - settling))
-        outside = []
-        low = self._inputs.min(axis=0)
-        high = self._inputs.max(axis=0)
-        models = self._model.draws(
-            self._inputs,
-            self._outputs,
-            self._settings,
-            DRAWS,
-            rng,
-            self._follows,
-        )
-        for number, drawn in enumerate(models):
-            model, errors_before = self._repeating(drawn)
-            expected = ExpectedCosts(self._problem, model, self._settings)
-            predicted, h, _ = model.predict(self._inputs)
-            persists = h * (errors_before @ model.persistence.T)
-            logged_costs, _ = expected(predicted + persists, h)
-            logged[number] = logged_costs[settling:]
-            limit = LOST * float(np.abs(logged_costs).max())
-            rollouts = self._rollout(thetas, start, model, picks)
-            for cost, samples in zip(costs, rollouts, strict=True):
-                # A loop that runs away ends early.
-                if len(samples.inputs) < count:
-                    continue
-                with np.errstate(over="ignore", invalid="ignore"):
-                    all_costs, _ = expected(samples.predicted, samples.h)
-                # A NaN is not below, either.
-                if (np.abs(all_costs) < limit).all():
-                    cost[number] = all_costs[settling:]
-            n = self._problem.n_states
-            states = rollouts[0].inputs[settling:, :n]
-            is_outside = (states < low[:n]) | (states > high[:n])
-            if len(states):
-                outside.append(float(is_outside.any(axis=1).mean()))
-        return _Draws(costs, logged, float(np.mean(outside)) if outside else 1.0)
-
-    def _repeating(self, drawn: EmpiricalModel) -> tuple[EmpiricalModel, Array]:
-        """A model with the errors that it makes of the log, in their order.
-
-        Under the logged actions it repeats the log, whatever its coefficients.
-
-        Args:
-            drawn: the model.
-
-        Returns:
-            The model, and r of the sample before each, (M, K).
-        """
-        predicted, h, _ = drawn.predict(self._inputs)
-        errors = (self._outputs - predicted) / h
-        # A rollout begins without one, and after a gap goes on from the last one before it.
-        before = np.concatenate([np.zeros_like(errors[:1]), errors[:-1]])
-        residuals = errors - before @ drawn.persistence.T
-        return replace(drawn, residuals=residuals), before
-
-
-def difference(costs: Array, others: Array) -> tuple[Estimate, float]:
-    """Mean difference of predicted costs, with an interval that holds model and chance.
-
-    The variance is that over models, of the mean over samples, and that of the mean over stretches
-    of the log, of the mean over models.
-
-    Args:
-        costs: of D models and M samples, (D, M).
-        others: what is subtracted, (D, M).
-
-    Returns:
-        The estimate, without interval where a model's cost is not finite; and the models' share of
-        its variance.
-    """
-    if not (np.isfinite(costs).all() and np.isfinite(others).all()):
-        return Estimate(np.inf if not np.isfinite(costs).all() else -np.inf), 1.0
-    differences = costs - others
-    by_model = differences.mean(axis=1)
-    value = float(by_model.mean())
-    of_models = float(by_model.var(ddof=1))
-    by_sample = differences.mean(axis=0)
-    # Costs that are correlated for hours leave stretches that are not independent: the longer ones
-    # count where their means spread more.
-    of_chance = 0.0
-    freedom_of_chance = BLOCKS[0] - 1
-    for n_blocks in BLOCKS:
-        blocks = np.array([block.mean() for block in np.array_split(by_sample, n_blocks)])
-        of_the_mean = float(blocks.var(ddof=1)) / n_blocks
-        if of_the_mean >= of_chance:
-            of_chance = of_the_mean
-            freedom_of_chance = n_blocks - 1
-    variance = of_models + of_chance
-    share = of_models / variance if variance else 0.0
-    # Degrees of freedom of a sum of two variances (Welch and Satterthwaite).
-    freedom = 1.0 / (share**2 / (DRAWS - 1) + (1.0 - share) ** 2 / freedom_of_chance)
-    quantile = float(stdtrit(freedom, 0.5 + LEVEL / 2))
-    half_width = quantile * variance**0.5
-    return Estimate(value, (value - half_width, value + half_width)), share
-
-
 def _upper_end(estimate: Estimate) -> float:
     """The upper end of an interval; infinite without one."""
     return np.inf if estimate.interval is None else estimate.interval[1]
@@ -910,8 +526,16 @@ def _known_parameters(
     problem: Problem,
     model: EmpiricalModel,
     settings: EmpiricalModelConfiguration,
+    least_shown: float,
 ) -> tuple[tuple[KnownParameter, ...], int]:
-    """What the log says of each parameter, and the number of directions that it shows."""
+    """What the log says of each parameter, and the number of directions that it shows.
+
+    Args:
+        problem: names parameters and nominal disturbances.
+        model: of the plant.
+        settings: the prior of the fit.
+        least_shown: share of a direction's prior variance that the log must remove to show it.
+    """
     p = model.features.n_parameters
     prior = settings.parameter_deviation
     left = model.covariance[:p, :p] / prior**2
@@ -923,7 +547,8 @@ def _known_parameters(
         deviation = prior * variance**0.5
         known.append(KnownParameter(quantity.name, change, deviation, 1.0 - variance))
     eigenvalues = np.linalg.eigvalsh(left)
-    return tuple(known), int((eigenvalues < HARDLY_SHOWN).sum())
+    is_shown = 1.0 - eigenvalues > least_shown
+    return tuple(known), int(is_shown.sum())
 
 
 def excitation(data: LoggedData, scenario: Scenario) -> dict[str, float]:

@@ -13,9 +13,13 @@ from cosim.core.simulation import indicators_of
 from cosim.core.statistics import mean
 from learning import ConfigurationError, train_from_data
 from learning.empirical_model import EmpiricalModel
-from learning.from_data import DRAWS, difference, excitation, usable
+from learning.from_data import excitation
+from learning.log_checks import usable
+from learning.log_configuration import LogConfiguration
+from learning.log_prediction import difference
 from tests.helpers.empirical import SETTINGS, fit, plant_data
 
+LOG = LogConfiguration()
 QUICK = {"coarse_rollout": 600, "fine_rollout": 900, "back_off_levels": [2.0, 7.0]}
 """A search of a second."""
 
@@ -41,7 +45,7 @@ def data(features, rng):
 
 
 def test_a_sound_log_is_used_as_it_is(data, paper, features):
-    used = usable(data, paper, features, SETTINGS)
+    used = usable(data, paper, features, SETTINGS, LOG)
     assert len(used) == len(data)
     assert used.left_out == {}
 
@@ -91,7 +95,7 @@ def steady(data):
 def test_a_log_that_is_misread_is_refused(data, paper, features, case):
     spoil, words = MISREAD[case]
     with pytest.raises(LoggedDataError, match=words):
-        usable(spoil(data), paper, features, SETTINGS)
+        usable(spoil(data), paper, features, SETTINGS, LOG)
 
 
 @pytest.mark.parametrize("length", [1, 4])
@@ -99,18 +103,26 @@ def test_a_spike_or_a_dropout_of_a_sensor_is_left_out(data, paper, features, len
     data = steady(data)
     data.next_states[100 : 100 + length, 0] += 30.0
     data.states[101 : 101 + length, 0] += 30.0
-    used = usable(data, paper, features, SETTINGS)
+    used = usable(data, paper, features, SETTINGS, LOG)
     assert used.left_out == {"jump there and back": length + 1}
     assert not used.follows[100]
 
 
+def test_a_setting_says_how_long_a_dropout_is(data, paper, features):
+    data = steady(data)
+    data.next_states[100:104, 0] += 30.0
+    data.states[101:105, 0] += 30.0
+    short = LOG.model_copy(update={"longest_dropout": 3})
+    assert usable(data, paper, features, SETTINGS, short).left_out == {}
+
+
 def test_a_jump_that_stays_is_the_plants(data, paper, features):
     data.next_states[100, 0] += 20.0
-    assert usable(data, paper, features, SETTINGS).left_out == {}
+    assert usable(data, paper, features, SETTINGS, LOG).left_out == {}
 
 
 def test_an_older_part_than_is_remembered_is_counted(data, paper, features):
-    used = usable(data, paper, features, SETTINGS.model_copy(update={"memory": 250}))
+    used = usable(data, paper, features, SETTINGS.model_copy(update={"memory": 250}), LOG)
     assert used.left_out == {"older than what is used": 150}
     assert not used.follows[0]
 
@@ -150,11 +162,11 @@ def test_drawn_models_differ_but_explain_the_data(features, rng):
 
 
 def test_a_differences_variance_is_of_models_and_of_chance(rng):
-    models = rng.normal(0.0, 2.0, (DRAWS, 1))
+    models = rng.normal(0.0, 2.0, (LOG.drawn_models, 1))
     # Eight stretches, within which costs are the same: sixteen would not be independent.
     chance = rng.normal(0.0, 8.0, 8)
     costs = 5.0 + models + np.repeat(chance, 100)
-    estimate, share = difference(costs, np.zeros_like(costs))
+    estimate, share = difference(costs, np.zeros_like(costs), LOG.stretches)
     of_models = models.var(ddof=1)
     of_chance = chance.var(ddof=1) / 8
     low, high = estimate.interval
@@ -166,11 +178,11 @@ def test_a_differences_variance_is_of_models_and_of_chance(rng):
 
 
 def test_a_lost_rollout_leaves_no_interval():
-    costs = np.ones((DRAWS, 100))
+    costs = np.ones((LOG.drawn_models, 100))
     lost = costs.copy()
     lost[3] = np.inf
-    assert difference(lost, costs)[0].interval is None
-    assert difference(costs, lost)[0].interval is None
+    assert difference(lost, costs, LOG.stretches)[0].interval is None
+    assert difference(costs, lost, LOG.stretches)[0].interval is None
 
 
 def test_what_only_follows_from_the_states_excites_nothing(data, paper):
@@ -195,6 +207,13 @@ def test_what_only_follows_from_the_states_excites_nothing(data, paper):
 def test_what_no_log_can_teach_is_refused(data, algorithm, name, words):
     with pytest.raises(ConfigurationError, match=words):
         train_from_data(algorithm, data, name)
+
+
+@pytest.mark.parametrize("wrong", [{"jumps": 3.0}, {"stretches": [1]}, {"drawn_models": 1}])
+def test_a_setting_that_means_nothing_is_refused(data, wrong):
+    (name,) = wrong
+    with pytest.raises(ConfigurationError, match=f"log settings: .*{name}"):
+        train_from_data("model-based", data, "paper", log_settings=wrong)
 
 
 def log_of(scenario, controller, samples, folder):

@@ -1,0 +1,328 @@
+"""What of a log is used to learn from, and which log is refused.
+
+Only the nominal model is asked. It says whether the log's columns, rows and units are those of its
+plant, which readings no plant has, and since when the plant is the present one.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.logged_data import LoggedData, LoggedDataError
+from cosim.core.protocols import Array
+from cosim.core.scenario import Scenario
+from learning.empirical_model import INTEGRATION_ERROR, EmpiricalModelConfiguration, Features
+from learning.log_configuration import LogConfiguration
+from learning.plant_data import PlantData
+
+
+def usable(
+    data: LoggedData,
+    scenario: Scenario,
+    features: Features,
+    settings: EmpiricalModelConfiguration,
+    log_settings: LogConfiguration,
+) -> LoggedData:
+    """The transitions that the nominal model can make sense of.
+
+    Refused is a log that speaks for another reading of itself, or of which the model makes nothing;
+    left out are jumps that no plant makes, and data from before a change of the plant.
+
+    Args:
+        data: the transitions.
+        scenario: names the variables.
+        features: the nominal model.
+        settings: how many are remembered, and how a change is told.
+        log_settings: how a doubtful log and a jump are told.
+
+    Raises:
+        LoggedDataError: the log is doubtful.
+    """
+    data = data.latest(settings.memory)
+    _check_reading(data, scenario, features, log_settings)
+    data = data.without(_jumps(data, features, log_settings), "jump there and back")
+    inputs, outputs = inputs_and_outputs(data, features)
+    n_outdated = PlantData(features, settings).outdated(inputs, outputs)
+    before_a_change = np.arange(len(data)) < n_outdated
+    return data.without(before_a_change, "before a change of the plant")
+
+
+def inputs_and_outputs(data: LoggedData, features: Features) -> tuple[Array, Array]:
+    """A log's M transitions as the empirical model takes them.
+
+    Args:
+        data: the transitions.
+        features: the nominal model, for a stage cost that is not logged.
+
+    Returns:
+        (s, a), (M, n+m), and (s₊, ℓ), (M, K).
+    """
+    inputs = np.column_stack([data.states, data.actions])
+    stage_cost = data.stage_cost
+    if stage_cost is None:
+        stage_cost = _nominal_cost(inputs, features)
+    outputs = np.column_stack([data.next_states, stage_cost])
+    return inputs, outputs
+
+
+def _nominal_cost(inputs: Array, features: Features) -> Array:
+    """The nominal model's stage cost with a little noise, (M,), at inputs (M, n+m)."""
+    no_errors = np.zeros(features.n_parameters)
+    y, _, _ = features(inputs, no_errors)
+    cost: Array = y[:, -1]
+    # An output without any error has no size, and its rounding would look like one: this noise is
+    # far above rounding, and a ten-thousandth of the cost.
+    deviation = 1e-4 * float(np.abs(cost).mean())
+    rng = np.random.default_rng(0)
+    noise: Array = rng.standard_normal(len(cost))
+    return cost + deviation * noise
+
+
+class _Errors(NamedTuple):
+    """What the nominal model does not explain of M transitions' states, over h.
+
+    Attributes:
+        errors: (M, n).
+        rounding: their least deviations, (M, n).
+    """
+
+    errors: Array
+    rounding: Array
+
+    def centred(self) -> _Errors:
+        """The same with errors of mean zero."""
+        return _Errors(self.errors - self.errors.mean(axis=0), self.rounding)
+
+    def log_likelihood(self) -> float:
+        """Of normal errors of mean zero and unknown covariance, but for a constant."""
+        count = len(self.errors)
+        covariance = self.errors.T @ self.errors / count
+        least_variance = (self.rounding**2).mean(axis=0)
+        _, logarithm = np.linalg.slogdet(covariance + np.diag(least_variance))
+        return float(-count * logarithm / 2)
+
+
+def _nominal_errors(
+    features: Features,
+    states: Array,
+    actions: Array,
+    next_states: Array,
+) -> _Errors:
+    """Errors of the nominal model's states; states (M, n), actions (M, m), next states (M, n)."""
+    n = states.shape[1]
+    inputs = np.column_stack([states, actions])
+    no_errors = np.zeros(features.n_parameters)
+    y, _, h = features(inputs, no_errors)
+    sizes = h[:, :n]
+    predicted = y[:, :n]
+    errors = (next_states - predicted) / sizes
+    rounding = INTEGRATION_ERROR * np.abs(predicted) / sizes
+    return _Errors(errors, rounding)
+
+
+def _check_reading(
+    data: LoggedData,
+    scenario: Scenario,
+    features: Features,
+    settings: LogConfiguration,
+) -> None:
+    """Refuse a log whose inputs are a row off, whose columns are exchanged, or of another plant.
+
+    Only the nominal model is asked, and only whether it explains the states better when the log is
+    read otherwise. A fitted model would find the controller's own law in inputs of the next row.
+    """
+    rows = _unbroken_rows(data, settings.largest_shift)
+    if len(rows) < 10 * features.n_outputs:
+        return
+    states = data.states[rows]
+    actions = data.actions[rows]
+    next_states = data.next_states[rows]
+    as_it_is = _nominal_errors(features, states, actions, next_states)
+    likelihood = as_it_is.log_likelihood()
+
+    # A shift leaves the mean error as it is, which is the plant's own.
+    gains = {}
+    centred_likelihood = as_it_is.centred().log_likelihood()
+    for shift in _shifts(settings.largest_shift):
+        shifted = data.actions[rows + shift]
+        reading = _nominal_errors(features, states, shifted, next_states).centred()
+        gains[_in_words(shift)] = reading.log_likelihood() - centred_likelihood
+    # Exchanged columns have another mean, and may make the model's states stand still: it counts.
+    plant = scenario.plant
+    for one, other in combinations(range(len(plant.actions)), 2):
+        words = f"columns {plant.actions[one]} and {plant.actions[other]} are exchanged"
+        exchanged = _exchanged(actions, one, other)
+        reading = _nominal_errors(features, states, exchanged, next_states)
+        gains[words] = reading.log_likelihood() - likelihood
+    for one, other in combinations(range(len(plant.states)), 2):
+        words = f"columns {plant.states[one]} and {plant.states[other]} are exchanged"
+        exchanged = _exchanged(states, one, other)
+        followers = _exchanged(next_states, one, other)
+        reading = _nominal_errors(features, exchanged, actions, followers)
+        gains[words] = reading.log_likelihood() - likelihood
+    best = max(gains, key=lambda words: gains[words])
+    if gains[best] > settings.misreading_evidence:
+        raise LoggedDataError(
+            f"the log looks as if {best}: the model then explains it better by "
+            f"{gains[best]:.0f} nats; correct the file (a dead time of the plant belongs in the "
+            "model)"
+        )
+    _check_units(data, rows, as_it_is.errors, scenario, features, settings)
+
+
+def _unbroken_rows(data: LoggedData, reach: int) -> NDArray[np.intp]:
+    """Rows of one unbroken stretch with so many before and behind them, whose inputs may shift."""
+    middle = np.arange(reach, len(data) - reach)
+    whole = np.ones(len(middle), bool)
+    for shift in range(1 - reach, reach + 1):
+        whole &= data.follows[middle + shift]
+    return middle[whole]
+
+
+def _shifts(largest: int) -> list[int]:
+    """Shifts of the inputs that are looked for, in rows: early ones are negative."""
+    shifts = []
+    for shift in range(-largest, largest + 1):
+        if shift != 0:
+            shifts.append(shift)
+    return shifts
+
+
+def _in_words(shift: int) -> str:
+    """What a shift of the inputs says of the log."""
+    way = "late" if shift > 0 else "early"
+    rows = "row" if abs(shift) == 1 else "rows"
+    return f"the inputs are logged {abs(shift)} {rows} {way}"
+
+
+def _exchanged(table: Array, one: int, other: int) -> Array:
+    """A table (M, ·) with two columns exchanged."""
+    exchanged = table.copy()
+    exchanged[:, [one, other]] = table[:, [other, one]]
+    return exchanged
+
+
+def _check_units(
+    data: LoggedData,
+    rows: NDArray[np.intp],
+    errors: Array,
+    scenario: Scenario,
+    features: Features,
+    settings: LogConfiguration,
+) -> None:
+    """Refuse a log whose states or stage cost are in another unit, or of another plant.
+
+    Args:
+        data: the transitions.
+        rows: those that are looked at, (M,).
+        errors: of their states by the nominal model, over h, (M, n).
+        scenario: names the states.
+        features: the nominal model.
+        settings: how large errors may be.
+    """
+    states = data.states[rows]
+    inputs = np.column_stack([states, data.actions[rows]])
+    no_errors = np.zeros(features.n_parameters)
+    y, _, h = features(inputs, no_errors)
+    # "Nothing changes" is the poorest model; one that is far poorer has other units.
+    changes = (data.next_states[rows] - states) / h[:, : states.shape[1]]
+    for i, name in enumerate(scenario.plant.states):
+        change = float(np.sqrt(np.mean(changes[:, i] ** 2)))
+        if _is_unlike(errors[:, i], change, settings):
+            raise LoggedDataError(
+                f"the model predicts {name} more than {settings.largest_error_ratio:g} times worse "
+                "than that it stays as it is: a unit or a column is wrong, or the model is of "
+                "another plant"
+            )
+    if data.stage_cost is None:
+        return
+    stage_cost = data.stage_cost[rows]
+    predicted_cost = y[:, -1]
+    cost_sizes = h[:, -1]
+    cost_errors = (stage_cost - predicted_cost) / cost_sizes
+    spread = float(np.std(stage_cost / cost_sizes))
+    if _is_unlike(cost_errors, spread, settings):
+        raise LoggedDataError(
+            f"the logged stage cost is {stage_cost.mean():.6g} on average, and the model's "
+            f"{predicted_cost.mean():.6g}: another unit, or another cost? Without the column the "
+            "model's is taken"
+        )
+
+
+def _is_unlike(errors: Array, spread: float, settings: LogConfiguration) -> bool:
+    """Whether a model's errors say that it is of something else, or in another unit.
+
+    Args:
+        errors: over h, (M,).
+        spread: root mean square of what they must be small against, over h.
+        settings: how large they may be against that, and which mean they must have.
+    """
+    size = float(np.sqrt(np.mean(errors**2)))
+    is_biased = abs(float(errors.mean())) > settings.least_bias
+    return size > settings.largest_error_ratio * spread and is_biased
+
+
+def _jumps(
+    data: LoggedData,
+    features: Features,
+    settings: LogConfiguration,
+) -> NDArray[np.bool_]:
+    """Transitions of a reading that leaves the plant's and comes back, (M,): a spike, a dropout.
+
+    A disturbance of the plant, be it as large, does not jump back by itself.
+    """
+    nominal = _nominal_errors(features, data.states, data.actions, data.next_states)
+    centre = np.median(nominal.errors, axis=0)
+    distance = np.abs(nominal.errors - centre)
+    # The median's deviation is not moved by the jumps themselves; of a normal law it is the
+    # standard deviation over 1.4826.
+    deviation = 1.4826 * np.median(distance, axis=0)
+    least_deviation = nominal.rounding.mean(axis=0)
+    sizes = distance / np.maximum(deviation, least_deviation)
+    changes = data.next_states - data.states
+
+    jumps = np.zeros(len(data), bool)
+    for i in range(sizes.shape[1]):
+        size = sizes[:, i]
+        change = changes[:, i]
+        candidates = np.flatnonzero(size > settings.jump_size)
+        for there in candidates.tolist():
+            back = _jump_back(there, size, change, data.follows, settings)
+            if back is None:
+                continue
+            jumps[there : back + 1] = True
+    return jumps
+
+
+def _jump_back(
+    there: int,
+    size: Array,
+    change: Array,
+    follows: NDArray[np.bool_],
+    settings: LogConfiguration,
+) -> int | None:
+    """The transition in which a reading that has jumped comes back; None where it stays.
+
+    Args:
+        there: the transition of the jump.
+        size: of the errors of this state, in deviations, (M,).
+        change: of this state in each transition, (M,).
+        follows: whether the transition before ends where this one begins, (M,).
+        settings: how large a jump back is, and how soon it comes.
+    """
+    largest = settings.largest_jump_ratio
+    end = min(there + 1 + settings.longest_dropout, len(size))
+    for later in range(there + 1, end):
+        if not follows[later]:
+            return None
+        # The model expects the plant to stay where the jump has led, not to come back.
+        if size[later] <= settings.return_size:
+            continue
+        ratio = -change[later] / change[there]
+        if 1 / largest < ratio < largest:
+            return later
+    return None

@@ -1,0 +1,216 @@
+"""What θ would have cost on the disturbances of a log.
+
+The model's errors are played back in their order, so that under the logged actions it repeats the
+log, and two controllers meet the same. This is done for draws from the posterior of the model's
+coefficients, so that the intervals hold what the log does not say of the plant, beside the chance
+of its disturbances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from controllers.problem import Problem
+from cosim.core.protocols import Array, Vector
+from cosim.core.statistics import LEVEL, Estimate
+from learning.empirical_model import EmpiricalModel
+from learning.model_based import ExpectedCosts, ModelBasedConfiguration
+from learning.rollout import Rollout
+
+
+class PredictedCosts(NamedTuple):
+    """Costs that D drawn models predict of the M samples that count.
+
+    Attributes:
+        thetas: of each θ, (D, M) each; infinite where a model's rollout is lost.
+        logged: of the logged operation, (D, M).
+        outside: share of the first θ's samples in which a state is where the plant has not been.
+    """
+
+    thetas: list[Array]
+    logged: Array
+    outside: float
+
+
+class Prediction:
+    """Predicts what θ would have cost on the disturbances of a log.
+
+    Args:
+        problem: has the penalty.
+        rollout: of the problem's controller.
+        model: the estimate from the log.
+        inputs: (s, a), (M, n+m).
+        outputs: (s₊, ℓ), (M, K).
+        settings: of the fit, of the expected penalty and of the samples before a rollout counts.
+        follows: whether each transition begins where the one before ends, (M,).
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        rollout: Rollout,
+        model: EmpiricalModel,
+        inputs: Array,
+        outputs: Array,
+        settings: ModelBasedConfiguration,
+        follows: NDArray[np.bool_],
+    ) -> None:
+        self._problem = problem
+        self._rollout = rollout
+        self._model = model
+        self._follows = follows
+        self._inputs = inputs
+        self._outputs = outputs
+        self._settings = settings
+        # A short log must not be burnt in whole.
+        self._burn_in = min(settings.burn_in, len(inputs) // 4)
+
+    def costs(
+        self,
+        thetas: Sequence[Vector],
+        count: int,
+        rng: np.random.Generator,
+    ) -> PredictedCosts:
+        """Costs of θ and of the log, by models drawn from the posterior.
+
+        Args:
+            thetas: θ (n_θ,) each.
+            count: number of models.
+            rng: draws them.
+        """
+        # All begin at the log's first state.
+        n_samples = len(self._inputs)
+        start = self._inputs[0, : self._problem.n_states]
+        picks = np.arange(n_samples, dtype=np.int32)
+        shape = (count, n_samples - self._burn_in)
+        logged = np.empty(shape)
+        costs = []
+        for _ in thetas:
+            costs.append(np.full(shape, np.inf))
+        outside = []
+        models = self._model.draws(
+            self._inputs,
+            self._outputs,
+            self._settings,
+            count,
+            rng,
+            self._follows,
+        )
+        for number, drawn in enumerate(models):
+            model, errors_before = self._repeating(drawn)
+            expected = ExpectedCosts(self._problem, model, self._settings)
+            predicted, h, _ = model.predict(self._inputs)
+            persists = h * (errors_before @ model.persistence.T)
+            logged_costs, _ = expected(predicted + persists, h)
+            logged[number] = logged_costs[self._burn_in :]
+            # A rollout beyond a million times the log's largest cost has run away.
+            limit = 1e6 * float(np.abs(logged_costs).max())
+            rollouts = self._rollout(thetas, start, model, picks)
+            for cost, samples in zip(costs, rollouts, strict=True):
+                # A loop that runs away ends early.
+                if len(samples.inputs) < n_samples:
+                    continue
+                with np.errstate(over="ignore", invalid="ignore"):
+                    all_costs, _ = expected(samples.predicted, samples.h)
+                # A NaN is not below, either.
+                if (np.abs(all_costs) < limit).all():
+                    cost[number] = all_costs[self._burn_in :]
+            states = rollouts[0].inputs[self._burn_in :, : self._problem.n_states]
+            if len(states):
+                outside.append(self._share_outside(states))
+        share_outside = float(np.mean(outside)) if outside else 1.0
+        return PredictedCosts(costs, logged, share_outside)
+
+    def _share_outside(self, states: Array) -> float:
+        """Share of states (·, n) where the plant has not been."""
+        n = self._problem.n_states
+        low = self._inputs.min(axis=0)[:n]
+        high = self._inputs.max(axis=0)[:n]
+        is_outside = (states < low) | (states > high)
+        return float(is_outside.any(axis=1).mean())
+
+    def _repeating(self, drawn: EmpiricalModel) -> tuple[EmpiricalModel, Array]:
+        """A model with the errors that it makes of the log, in their order.
+
+        Under the logged actions it repeats the log, whatever its coefficients.
+
+        Args:
+            drawn: the model.
+
+        Returns:
+            The model, and r of the sample before each, (M, K).
+        """
+        predicted, h, _ = drawn.predict(self._inputs)
+        errors = (self._outputs - predicted) / h
+        # A rollout begins without one, and after a gap goes on from the last one before it.
+        before = np.concatenate([np.zeros_like(errors[:1]), errors[:-1]])
+        residuals = errors - before @ drawn.persistence.T
+        return replace(drawn, residuals=residuals), before
+
+
+def difference(
+    costs: Array,
+    others: Array,
+    stretches: Sequence[int],
+) -> tuple[Estimate, float]:
+    """Mean difference of predicted costs, with an interval that holds model and chance.
+
+    The variance is that over models, of the mean over samples, and that of the mean over stretches
+    of the log, of the mean over models.
+
+    Args:
+        costs: of D models and M samples, (D, M).
+        others: what is subtracted, (D, M).
+        stretches: numbers of stretches that the log is parted in; the one counts by which the mean
+            spreads most.
+
+    Returns:
+        The estimate, without interval where a model's cost is not finite; and the models' share of
+        its variance.
+    """
+    if not np.isfinite(costs).all():
+        return Estimate(np.inf), 1.0
+    if not np.isfinite(others).all():
+        return Estimate(-np.inf), 1.0
+    differences = costs - others
+    mean_by_model = differences.mean(axis=1)
+    value = float(mean_by_model.mean())
+    variance_of_models = float(mean_by_model.var(ddof=1))
+    freedom_of_models = len(costs) - 1
+    mean_by_sample = differences.mean(axis=0)
+    variance_of_chance, freedom_of_chance = _chance(mean_by_sample, stretches)
+
+    variance = variance_of_models + variance_of_chance
+    share = variance_of_models / variance if variance else 0.0
+    # Degrees of freedom of a sum of two variances (Welch and Satterthwaite).
+    part_of_models = share**2 / freedom_of_models
+    part_of_chance = (1.0 - share) ** 2 / freedom_of_chance
+    freedom = 1.0 / (part_of_models + part_of_chance)
+    quantile = float(stdtrit(freedom, 0.5 + LEVEL / 2))
+    half_width = quantile * variance**0.5
+    return Estimate(value, (value - half_width, value + half_width)), share
+
+
+def _chance(values: Array, stretches: Sequence[int]) -> tuple[float, int]:
+    """Variance of the mean of values in time, (M,), and its degrees of freedom.
+
+    Values that are correlated for hours leave stretches that are not independent: the longer ones
+    count where their means spread more.
+    """
+    variance = 0.0
+    freedom = stretches[0] - 1
+    for count in stretches:
+        means = []
+        for stretch in np.array_split(values, count):
+            means.append(stretch.mean())
+        of_the_mean = float(np.var(means, ddof=1)) / count
+        if of_the_mean >= variance:
+            variance = of_the_mean
+            freedom = count - 1
+    return variance, freedom

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.logged_data import LoggedData, LoggedDataError
+from cosim.core.logged_data import FEWEST, LoggedData, LoggedDataError
 from cosim.core.protocols import Array
 from cosim.core.scenario import Scenario
 from learning.empirical_model import INTEGRATION_ERROR, EmpiricalModelConfiguration, Features
@@ -40,7 +40,7 @@ def usable(
         log_settings: how a doubtful log and a jump are told.
 
     Raises:
-        LoggedDataError: the log is doubtful.
+        LoggedDataError: the log is doubtful, or too little of it is left.
     """
     data = data.latest(settings.memory)
     _check_reading(data, scenario, features, log_settings)
@@ -48,7 +48,17 @@ def usable(
     inputs, outputs = inputs_and_outputs(data, features)
     n_outdated = PlantData(features, settings).outdated(inputs, outputs)
     before_a_change = np.arange(len(data)) < n_outdated
-    return data.without(before_a_change, "before a change of the plant")
+    used = data.without(before_a_change, "before a change of the plant")
+    # Fewer could not be parted in stretches: an interval would lack the disturbances' chance.
+    if len(used) < FEWEST:
+        counts = []
+        for reason, count in used.left_out.items():
+            counts.append(f"{reason}: {count}")
+        raise LoggedDataError(
+            f"{len(used)} transitions of the log can be used, and {FEWEST} are needed; left out "
+            f"are {', '.join(counts) or 'none'}"
+        )
+    return used
 
 
 def inputs_and_outputs(data: LoggedData, features: Features) -> tuple[Array, Array]:

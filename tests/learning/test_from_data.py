@@ -127,6 +127,12 @@ def test_an_older_part_than_is_remembered_is_counted(data, paper, features):
     assert not used.follows[0]
 
 
+def test_a_log_of_which_too_little_is_left_is_refused(data, paper, features):
+    few = SETTINGS.model_copy(update={"memory": 119})
+    with pytest.raises(LoggedDataError, match=r"119 .* 120 are needed; .* what is used: 281"):
+        usable(data, paper, features, few, LOG)
+
+
 def test_errors_do_not_persist_over_a_gap(features, rng):
     inputs, outputs = plant_data(features, rng, 300, np.zeros(features.n_parameters))
     y, _, h = features(inputs, np.zeros(features.n_parameters))

@@ -43,8 +43,9 @@ def usable(
         LoggedDataError: the log is doubtful, or too little of it is left.
     """
     data = data.latest(settings.memory)
-    _check_reading(data, scenario, features, log_settings)
-    data = data.without(_jumps(data, features, log_settings), "jump there and back")
+    _check_order(data, scenario, features, log_settings)
+    _check_units(data, scenario, features, log_settings)
+    data = data.without(_there_and_back(data, features, log_settings), "jump there and back")
     inputs, outputs = inputs_and_outputs(data, features)
     n_outdated = PlantData(features, settings).outdated(inputs, outputs)
     before_a_change = np.arange(len(data)) < n_outdated
@@ -56,7 +57,7 @@ def usable(
             counts.append(f"{reason}: {count}")
         raise LoggedDataError(
             f"{len(used)} transitions of the log can be used, and {FEWEST} are needed; left out "
-            f"are {', '.join(counts) or 'none'}"
+            f"are {', '.join(counts) or 'none'}; log longer, or leave out less"
         )
     return used
 
@@ -134,13 +135,13 @@ def _nominal_errors(
     return _Errors(errors, rounding)
 
 
-def _check_reading(
+def _check_order(
     data: LoggedData,
     scenario: Scenario,
     features: Features,
     settings: LogConfiguration,
 ) -> None:
-    """Refuse a log whose inputs are a row off, whose columns are exchanged, or of another plant.
+    """Refuse a log whose inputs are a row off, or whose columns are exchanged.
 
     Only the nominal model is asked, and only whether it explains the states better when the log is
     read otherwise. A fitted model would find the controller's own law in inputs of the next row.
@@ -181,7 +182,6 @@ def _check_reading(
             f"{gains[best]:.0f} nats; correct the file (a dead time of the plant belongs in the "
             "model)"
         )
-    _check_units(data, rows, as_it_is.errors, scenario, features, settings)
 
 
 def _unbroken_rows(data: LoggedData, reach: int) -> NDArray[np.intp]:
@@ -218,28 +218,19 @@ def _exchanged(table: Array, one: int, other: int) -> Array:
 
 def _check_units(
     data: LoggedData,
-    rows: NDArray[np.intp],
-    errors: Array,
     scenario: Scenario,
     features: Features,
     settings: LogConfiguration,
 ) -> None:
-    """Refuse a log whose states or stage cost are in another unit, or of another plant.
-
-    Args:
-        data: the transitions.
-        rows: those that are looked at, (M,).
-        errors: of their states by the nominal model, over h, (M, n).
-        scenario: names the states.
-        features: the nominal model.
-        settings: how large errors may be.
-    """
-    states = data.states[rows]
-    inputs = np.column_stack([states, data.actions[rows]])
+    """Refuse a log whose states or stage cost are in another unit, or of another plant."""
+    n = data.states.shape[1]
+    inputs = np.column_stack([data.states, data.actions])
     no_errors = np.zeros(features.n_parameters)
     y, _, h = features(inputs, no_errors)
+    sizes = h[:, :n]
+    errors = (data.next_states - y[:, :n]) / sizes
+    changes = (data.next_states - data.states) / sizes
     # "Nothing changes" is the poorest model; one that is far poorer has other units.
-    changes = (data.next_states[rows] - states) / h[:, : states.shape[1]]
     for i, name in enumerate(scenario.plant.states):
         change = float(np.sqrt(np.mean(changes[:, i] ** 2)))
         if _is_unlike(errors[:, i], change, settings):
@@ -250,7 +241,7 @@ def _check_units(
             )
     if data.stage_cost is None:
         return
-    stage_cost = data.stage_cost[rows]
+    stage_cost = data.stage_cost
     predicted_cost = y[:, -1]
     cost_sizes = h[:, -1]
     cost_errors = (stage_cost - predicted_cost) / cost_sizes
@@ -276,7 +267,7 @@ def _is_unlike(errors: Array, spread: float, settings: LogConfiguration) -> bool
     return size > settings.largest_error_ratio * spread and is_biased
 
 
-def _jumps(
+def _there_and_back(
     data: LoggedData,
     features: Features,
     settings: LogConfiguration,

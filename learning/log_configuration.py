@@ -22,7 +22,7 @@ class LogConfiguration(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     # what is refused
-    largest_shift: Count = Field(
+    largest_shift: Annotated[int, Field(ge=1, le=20)] = Field(
         2,
         description="rows by which the inputs may be logged early or late, to be looked for",
     )

@@ -98,6 +98,13 @@ def test_a_log_that_is_misread_is_refused(data, paper, features, case):
         usable(spoil(data), paper, features, SETTINGS, LOG)
 
 
+def test_a_wrong_unit_is_seen_in_a_log_of_pieces(data, paper, features):
+    spoil, words = MISREAD["unit"]
+    pieces = replace(spoil(data), follows=np.arange(len(data)) % 2 == 1)
+    with pytest.raises(LoggedDataError, match=words):
+        usable(pieces, paper, features, SETTINGS, LOG)
+
+
 @pytest.mark.parametrize("length", [1, 4])
 def test_a_spike_or_a_dropout_of_a_sensor_is_left_out(data, paper, features, length):
     data = steady(data)

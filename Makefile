@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One process a core; tests of one file share what they build.
 PYTEST := $(BIN)/python -m pytest -n auto
 
-.PHONY: demo test check docs campaign sanitised clean
+.PHONY: demo test check docs campaign emulated sanitised clean
 
 demo: $(VENV)/installed
 	$(BIN)/cosim demo --out demo
@@ -38,6 +38,10 @@ docs: build/figures
 # What takes many minutes a test and is run by hand.
 campaign: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m campaign
+
+# The binaries for ARM and Windows give the native ones' bits, under qemu and wine.
+emulated: $(VENV)/installed-dev
+	$(PYTEST) -m emulated
 
 # The exported C, of plants and controllers, under AddressSanitizer and UBSan: once per release.
 sanitised: $(VENV)/installed

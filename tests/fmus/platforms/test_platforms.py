@@ -1,6 +1,6 @@
 """Binaries of plant and controller: each platform's gives the bits of the native one.
 
-Those that need an emulator take minutes, of which most is its start: `make campaign`.
+Those that need an emulator take minutes, of which most is its start: `make emulated`, which CI runs too.
 """
 
 import zipfile
@@ -42,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory):
     return runner
 
 
-@pytest.mark.campaign
+@pytest.mark.emulated
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", OTHERS)
 def test_ten_thousand_steps_are_bit_identical_to_the_native_ones(run, name, version, law) -> None:
@@ -89,7 +89,7 @@ def run_controller(exported):
     return cache(exported.run_or_skip)
 
 
-@pytest.mark.campaign
+@pytest.mark.emulated
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_controllers_samples_are_bit_identical_to_the_native_ones(
     run_controller, name: str

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One process a core; tests of one file share what they build.
 PYTEST := $(BIN)/python -m pytest -n auto
 
-.PHONY: demo test check docs campaign emulated sanitised clean
+.PHONY: demo test check docs campaign platforms sanitised clean
 
 demo: $(VENV)/installed
 	$(BIN)/cosim demo --out demo
@@ -39,9 +39,9 @@ docs: build/figures
 campaign: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m campaign
 
-# The binaries for ARM and Windows give the native ones' bits, under qemu and wine.
-emulated: $(VENV)/installed-dev
-	$(PYTEST) -m emulated
+# Binaries for every platform; those for ARM and Windows give the native ones' bits under qemu and wine.
+platforms: $(VENV)/installed-dev
+	$(PYTEST) -m platforms
 
 # The exported C, of plants and controllers, under AddressSanitizer and UBSan: once per release.
 sanitised: $(VENV)/installed

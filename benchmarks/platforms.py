@@ -58,7 +58,7 @@ Written by `python -m benchmarks.platforms`, which runs all that can be run on a
 machine on x86-64 with Debian's qemu-user, libc6-arm64-cross and wine64, and PyPI's ziglang. A small
 C program steps the library of each platform {STEPS} times and hashes the bits of every state,
 derivative and output after each step; the verdict compares the hashes with those of Linux on
-x86-64. `make emulated`
+x86-64. `make platforms`
 holds the files to this."""
 
 

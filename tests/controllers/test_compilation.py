@@ -42,7 +42,13 @@ def test_a_library_is_made_once_for_its_content(folder):
     assert sorted(folder.glob("*.lib")) == sorted([first, other])
 
 
-ENTRY_POINTS = (b"engine_run\0", b"rollout\0", b"features_at\0", b"optimal_run\0")
+ENTRY_POINTS = (
+    b"engine_run\0",
+    b"filter_predict\0",
+    b"rollout\0",
+    b"features_at\0",
+    b"optimal_run\0",
+)
 """Of each library that is stored, one is a public function."""
 
 

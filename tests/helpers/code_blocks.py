@@ -86,6 +86,12 @@ class Session:
         self.page, self.folder = page, folder
         self.namespace: dict[str, object] = {"__name__": "page"}
         self.commands = 0
+        self.environment = os.environ | {
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        }
+        # Its commands compute for long: with a reader's compiler, not with the tests' quick one.
+        if is_slow(page):
+            self.environment.pop("CC", None)
         for needed in re.findall(r"<!-- needs (\S+) -->", page.read_text()):
             (folder / needed).parent.mkdir(parents=True, exist_ok=True)
             (folder / needed).symlink_to(ROOT / needed)
@@ -133,7 +139,7 @@ class Session:
                 command,
                 shell=True,
                 cwd=self.folder,
-                env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
+                env=self.environment,
                 capture_output=True,
                 text=True,
                 check=False,

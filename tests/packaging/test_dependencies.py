@@ -105,8 +105,9 @@ def test_what_is_installed_agrees():
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-# On Linux the tests' own environment was installed from these pins.
-@pytest.mark.slow
+# Once per release: it asks the registry for every package. On Linux the tests' own environment was
+# installed from these pins.
+@pytest.mark.campaign
 @pytest.mark.parametrize("platform", ["darwin", "win32"])
 def test_the_registry_has_a_wheel_of_every_locked_version(platform, tmp_path):
     pins = tmp_path / "constraints.txt"

@@ -1,6 +1,6 @@
 """Binaries of plant and controller: each platform's gives the bits of the native one.
 
-Those that need an emulator take minutes, of which most is its start: `make emulated`, which CI runs too.
+Cross-compilers and emulators take minutes: `make platforms`, which CI runs too.
 """
 
 import zipfile
@@ -26,7 +26,7 @@ from tests.helpers.platforms import (
     verdict,
 )
 
-pytestmark = CROSS
+pytestmark = [pytest.mark.platforms, CROSS]
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +42,6 @@ def run(tmp_path_factory: pytest.TempPathFactory):
     return runner
 
 
-@pytest.mark.emulated
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", OTHERS)
 def test_ten_thousand_steps_are_bit_identical_to_the_native_ones(run, name, version, law) -> None:
@@ -51,13 +50,11 @@ def test_ten_thousand_steps_are_bit_identical_to_the_native_ones(run, name, vers
     assert verdict(native, other) == "bit-identical"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_both_fmi_versions_give_the_same_bits(run, law: str) -> None:
     assert run(NATIVE, 2, law) == run(NATIVE, 3, law)
 
 
-@pytest.mark.slow
 def test_laws_differ(run) -> None:
     """The hashes see what they are to compare."""
     assert len({run(NATIVE, 2, law)[0] for law in LAWS[:3]}) == 3
@@ -69,7 +66,6 @@ def exported(request, tmp_path_factory) -> Hosted:
     return hosted_controller(request.param, tmp_path_factory.mktemp("exported"))
 
 
-@pytest.mark.slow
 def test_it_holds_a_library_for_each_platform(exported) -> None:
     with zipfile.ZipFile(exported.fmu) as container:
         held = {name for name in container.namelist() if name.startswith("binaries/")}
@@ -89,7 +85,6 @@ def run_controller(exported):
     return cache(exported.run_or_skip)
 
 
-@pytest.mark.emulated
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_controllers_samples_are_bit_identical_to_the_native_ones(
     run_controller, name: str

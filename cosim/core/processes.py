@@ -39,6 +39,8 @@ unwound.set()
 _SIGNALS = [
     getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)
 ]
+_repeats: list[threading.Timer] = []
+"""Threads that raise a signal once more, a second after it."""
 
 
 @contextmanager
@@ -59,6 +61,12 @@ def command_process() -> Iterator[None]:
         yield
     finally:
         unwound.set()
+        # One that is about to raise its signal does so while it is ignored: the caller's handler
+        # would end the process by it.
+        for timer in _repeats:
+            timer.cancel()
+            timer.join()
+        _repeats.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
             atexit.register(signal.signal, number, signal.SIG_IGN)
@@ -85,6 +93,7 @@ def _raise(number: int, _: FrameType | None) -> None:
     timer = threading.Timer(1.0, again)
     timer.daemon = True
     timer.start()
+    _repeats.append(timer)
     raise KeyboardInterrupt if number == signal.SIGINT else Terminated
 
 

@@ -156,3 +156,23 @@ def test_a_training_is_neither_overwritten_nor_mixed_unless_asked(tmp_path):
     assert (tmp_path / "learning.csv").read_bytes() == kept
     assert run_cosim(*words, "--seed", "1", "--overwrite").returncode == 0
     assert (tmp_path / "learning.csv").read_bytes() != kept
+
+
+REPEATED = """
+import os, signal, threading
+from cosim.core.processes import command_process
+
+try:
+    with command_process():
+        os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    print(threading.active_count())
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_a_signal_is_not_raised_once_more_behind_its_command():
+    """The thread that would do so has ended: the handlers are the caller's from here on."""
+    words = [sys.executable, "-c", REPEATED]
+    result = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert result.stdout == "1\n"

@@ -370,6 +370,12 @@ class Model:
         return tuple(given)
 
     @property
+    def variable_units(self) -> dict[str, str]:
+        """Unit of each state and action, by name."""
+        quantities = (*self.states, *self.actions)
+        return {quantity.name: quantity.unit for quantity in quantities}
+
+    @property
     def nominal_disturbance(self) -> NDArray[np.float64]:
         """Nominal disturbance, shape (n_d,)."""
         return np.array([quantity.nominal for quantity in self.disturbances])

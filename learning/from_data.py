@@ -257,18 +257,12 @@ def train_from_data(
             data,
             scenario,
             columns=columns,
-            units=units_of(problem),
+            units=problem.model.variable_units,
             leave_out=leave_out,
         )
     # The rules' matrices are small: BLAS's second thread spins for longer than it computes.
     with threadpool_limits(limits=1, user_api="blas"):
         return _train(run, checked_settings, problem, data)
-
-
-def units_of(problem: Problem) -> dict[str, str]:
-    """Unit of each state and action of a problem's model, by name."""
-    quantities = (*problem.model.states, *problem.model.actions)
-    return {quantity.name: quantity.unit for quantity in quantities}
 
 
 def _check_run(run: TrainingRun) -> None:

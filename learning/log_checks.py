@@ -80,10 +80,16 @@ def inputs_and_outputs(data: LoggedData, features: Features) -> tuple[Array, Arr
     return inputs, outputs
 
 
+def _nominal(features: Features, inputs: Array) -> tuple[Array, Array]:
+    """What the nominal model predicts at inputs (M, n+m), and the errors' sizes h, (M, K)."""
+    no_errors = np.zeros(features.n_parameters)
+    y, _, h = features(inputs, no_errors)
+    return y, h
+
+
 def _nominal_cost(inputs: Array, features: Features) -> Array:
     """The nominal model's stage cost with a little noise, (M,), at inputs (M, n+m)."""
-    no_errors = np.zeros(features.n_parameters)
-    y, _, _ = features(inputs, no_errors)
+    y, _ = _nominal(features, inputs)
     cost: Array = y[:, -1]
     # An output without any error has no size, and its rounding would look like one: this noise is
     # far above rounding, and a ten-thousandth of the cost.
@@ -125,9 +131,7 @@ def _nominal_errors(
 ) -> _Errors:
     """Errors of the nominal model's states; states (M, n), actions (M, m), next states (M, n)."""
     n = states.shape[1]
-    inputs = np.column_stack([states, actions])
-    no_errors = np.zeros(features.n_parameters)
-    y, _, h = features(inputs, no_errors)
+    y, h = _nominal(features, np.column_stack([states, actions]))
     sizes = h[:, :n]
     predicted = y[:, :n]
     errors = (next_states - predicted) / sizes
@@ -224,9 +228,7 @@ def _check_units(
 ) -> None:
     """Refuse a log whose states or stage cost are in another unit, or of another plant."""
     n = data.states.shape[1]
-    inputs = np.column_stack([data.states, data.actions])
-    no_errors = np.zeros(features.n_parameters)
-    y, _, h = features(inputs, no_errors)
+    y, h = _nominal(features, np.column_stack([data.states, data.actions]))
     sizes = h[:, :n]
     errors = (data.next_states - y[:, :n]) / sizes
     changes = (data.next_states - data.states) / sizes

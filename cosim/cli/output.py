@@ -20,6 +20,8 @@ from cosim.core.files import write_atomically
 from cosim.core.processes import Terminated, hold, redirected_output, release
 from cosim.core.training_options import MOST
 
+MOST_DRAWN = 20_000
+"""Samples of the longest run that is drawn: more are a grey band, and take seconds."""
 LONG_DOCUMENT = 1 << 20
 """Bytes from which on a JSON document is written on one line: what is indented Python writes."""
 

@@ -11,8 +11,6 @@ import cosim
 from cosim.cli import logged_data
 from cosim.cli import output as cli
 
-MOST_DRAWN = 20_000
-"""Rows of the longest log that is drawn: more are a grey band, and take seconds."""
 SHADOW_FILES = ("shadow.csv", "shadow.png", "summary.json", "scenario.toml", "shadow.rrd")
 """Files of a shadow; all in a folder belong to one."""
 
@@ -43,12 +41,13 @@ def shadow(
         from cosim.core.files import staged
         from cosim.core.logged_data import read_log
         from cosim.shadow import given_names, shadow
-        from learning.from_data import units_of
 
         loaded = cosim.Scenario.load(scenario)
         law = cosim.build_controller(controller, loaded)
         # Without a model nothing but the FMU knows the units, and that is not opened.
-        units = units_of(Problem.from_scenario(loaded)) if loaded.controller.model else {}
+        units = (
+            Problem.from_scenario(loaded).model.variable_units if loaded.controller.model else {}
+        )
         table = read_log(
             data,
             loaded,
@@ -62,7 +61,7 @@ def shadow(
         summary = result.summary()
         with staged(folder, SHADOW_FILES) as stage:
             result.write_csv(stage / "shadow.csv")
-            if 1 < len(result) <= MOST_DRAWN:
+            if 1 < len(result) <= cli.MOST_DRAWN:
                 result.plot(stage / "shadow.png")
             if record:
                 from cosim.recording import record_overlay

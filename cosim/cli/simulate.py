@@ -10,8 +10,6 @@ import typer
 import cosim
 from cosim.cli import output as cli
 
-MOST_DRAWN = 20_000
-"""Samples of the longest run that is drawn: more are a grey band, and take seconds."""
 SIMULATION_FILES = (
     "trajectory.csv", "trajectory.png", "timing.csv", "summary.json", "scenario.toml", "run.rrd",
 )  # fmt: skip
@@ -130,7 +128,7 @@ def _simulate(
     run.write_csv(folder / "trajectory.csv")
     run.write_timing_csv(folder / "timing.csv")
     # One sample makes no line.
-    if 1 < len(run) <= MOST_DRAWN:
+    if 1 < len(run) <= cli.MOST_DRAWN:
         run.plot(folder / "trajectory.png")
     (folder / "scenario.toml").write_text(scenario.to_toml(), "utf-8")
     return summary

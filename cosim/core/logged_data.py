@@ -106,22 +106,9 @@ class LoggedData:
 
     def latest(self, count: int) -> LoggedData:
         """The same with so many of the latest transitions; the others are counted as older."""
-        n_older = max(len(self) - count, 0)
-        if not n_older:
-            return self
-        older = {"older than what is used": n_older}
-        follows = self.follows[n_older:].copy()
-        follows[0] = False
-        return LoggedData(
-            self.time[n_older:],
-            self.states[n_older:],
-            self.actions[n_older:],
-            self.next_states[n_older:],
-            None if self.stage_cost is None else self.stage_cost[n_older:],
-            follows,
-            self.rows,
-            {**self.left_out, **older},
-        )
+        n_older = len(self) - count
+        is_older = np.arange(len(self)) < n_older
+        return self.without(is_older, "older than what is used")
 
     def without(self, doubtful: Flags, reason: str) -> LoggedData:
         """The same without some of the transitions.

@@ -24,8 +24,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # pytest's own filter ends with this process; what tests start has to be as strict.
 os.environ.setdefault("PYTHONWARNINGS", "error")
-# Some of them are a fifth slower where each command compiles the packages' Python anew.
+# Where no bytecode is kept, each process compiles the packages' Python anew, and each of pytest's
+# the tests' assertions.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 # As users have it: what is long is compiled. Tests of the interpreted path say so (`interpreted`).
 os.environ.pop("COSIM_COMPILE", None)
 OWN = "COSIM_CACHE" not in os.environ

@@ -3,15 +3,19 @@
 import doctest
 import importlib
 import importlib.util
+import io
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
 import warnings
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 ROOT = Path(__file__).parents[2]
 FENCE = re.compile(r"^```(\w*)[ ]*([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -38,12 +42,21 @@ COVERED = {
     "cosim fmu info|check|build": "a synopsis; tests/cosim/cli/test_fmu.py",
     "cosim results check|update|draw": "a synopsis; tests/cosim/studies/test_stored.py",
 }
-# Typed with a smaller budget than the page's, which is meant for a reader with time.
+# Done with a smaller budget than the page's, which is meant for a reader with time: what is shown is
+# that each step is done and feeds the next one. What comes out of a whole budget has its own tests.
 SMALLER = {
     "naive,tuned,optimal,": "naive,tuned,",
     "--seeds 20 --steps 1000": "--seeds 2 --steps 100",
-    "--samples 40000": "--samples 5000",
-    "--samples 1440": "--samples 300",
+    "--seeds 3 --steps 1000": "--seeds 2 --steps 200",
+    "--samples 4000 --steps 100": "--samples 1000 --steps 20",
+    "--samples 40000": "--samples 2000",
+    "--samples 20000": "--samples 4000",
+    "20000 samples": "4000 samples",
+    "--samples 10000": "--samples 4000",
+    "--samples 1440": "--samples 120 --set coarse_rollout=600 --set fine_rollout=900",
+    "samples=4000, seed=0, evaluate_every=1000": "samples=1000, seed=0, evaluate_every=500",
+    "\nsamples = 1000\n": "\nsamples = 250\n",
+    "log_every = 250 }": "log_every = 50 }",
 }
 SLOW = {"scenario.md", "fmpy.md", "README.md"}
 CHECKER = doctest.OutputChecker()
@@ -66,12 +79,19 @@ def pages() -> list[Path]:
 
 
 def blocks(page: Path) -> list[Block]:
-    """The fenced blocks of a page, in order."""
+    """The fenced blocks of a page, in order, with the tests' budgets."""
     text = page.read_text()
     return [
-        Block(match[1], match[2], match[3], text[: match.start()].count("\n") + 1)
+        Block(match[1], match[2], with_less(match[3]), text[: match.start()].count("\n") + 1)
         for match in FENCE.finditer(text)
     ]
+
+
+def with_less(text: str) -> str:
+    """A block's text with the budgets of `SMALLER`."""
+    for budget, smaller in SMALLER.items():
+        text = text.replace(budget, smaller)
+    return text
 
 
 def is_slow(page: Path) -> bool:
@@ -89,9 +109,6 @@ class Session:
         self.environment = os.environ | {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         }
-        # Its commands compute for long: with a reader's compiler, not with the tests' quick one.
-        if is_slow(page):
-            self.environment.pop("CC", None)
         for needed in re.findall(r"<!-- needs (\S+) -->", page.read_text()):
             (folder / needed).parent.mkdir(parents=True, exist_ok=True)
             (folder / needed).symlink_to(ROOT / needed)
@@ -132,21 +149,43 @@ class Session:
             command = command.strip()
             if command in COVERED:
                 continue
-            for budget, smaller in SMALLER.items():
-                command = command.replace(budget, smaller)
             code = re.search(r"exit code (\d+)", comment)
-            result = subprocess.run(
-                command,
-                shell=True,
-                cwd=self.folder,
-                env=self.environment,
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-            said = result.stdout + result.stderr
-            assert result.returncode == (int(code[1]) if code else 0), f"{where}: {line}\n{said}"
+            returned, said = self._run(command)
+            assert returned == (int(code[1]) if code else 0), f"{where}: {line}\n{said}"
             self.commands += 1
             if expected.strip():
                 fits = CHECKER.check_output(expected, said, FLAGS)
                 assert fits, f"{where}: {line}\nexpected\n{expected}\ngot\n{said}"
+
+    def _run(self, command: str) -> tuple[int, str]:
+        """Exit code and text of a command; a plain `cosim` runs in this process, loaded already."""
+        if command.startswith("cosim ") and not set(command) & set("|<>;&*$"):
+            return run_here(shlex.split(command)[1:])
+        result = subprocess.run(
+            command,
+            shell=True,
+            cwd=self.folder,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return result.returncode, result.stdout + result.stderr
+
+
+def run_here(words: list[str]) -> tuple[int, str]:
+    """Run `cosim` with these words in this process; returns its exit code and what it printed."""
+    from cosim.cli import main
+
+    out, err = io.StringIO(), io.StringIO()
+    code = 0
+    with (
+        redirect_stdout(out),
+        redirect_stderr(err),
+        mock.patch.object(sys, "argv", ["cosim", *words]),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return code, out.getvalue() + err.getvalue()

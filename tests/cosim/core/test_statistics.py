@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.stats import trim_mean, wilcoxon
+from scipy.stats import bootstrap, trim_mean, wilcoxon
 
 from cosim.core import statistics
 from cosim.core.statistics import (
@@ -199,3 +199,24 @@ def test_the_median_over_runs_has_the_interval_of_runs_drawn_anew(rng):
 def test_one_run_has_no_interval_and_a_diverged_one_an_infinite_end():
     assert statistics.median_over_runs(np.array([3.0])) == (3.0, None)
     assert statistics.median_over_runs(np.array([3.0, np.inf, 3.0])) == (3.0, (3.0, np.inf))
+
+
+def test_the_bootstraps_are_those_of_scipy():
+    rng = np.random.default_rng(4)
+    below = rng.uniform(5.0, 6.0, 12)
+    above = rng.lognormal(0.0, 1.0, 12)
+    settings = {"n_resamples": 9999, "vectorized": True}
+
+    def quotient(a, b, axis):
+        return a.mean(axis) / b.mean(axis)
+
+    expected = bootstrap((above, below), quotient, paired=True, rng=0, **settings)
+    assert bootstrapped(above, below) == pytest.approx(expected.confidence_interval, rel=1e-12)
+
+    strata = [rng.lognormal(0.0, 1.0, count) for count in (3, 5)]
+
+    def middle(*runs, axis):
+        return interquartile_mean(np.concatenate(runs, axis), axis)
+
+    expected = bootstrap(strata, middle, method="percentile", rng=0, **settings)
+    assert over_runs(strata).interval == pytest.approx(expected.confidence_interval, rel=1e-12)

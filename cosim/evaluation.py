@@ -50,8 +50,8 @@ WORKER_START = 2.0
 """Seconds of work below which starting workers takes longer than doing it."""
 ITEM_SECONDS = 0.5
 """Seconds of an item of work of our own code, about: each moves the bar."""
-ITEM_SAMPLES = 200
-"""Samples of an item of others' code, about: few, since a plant may take its time."""
+ITEM_SAMPLES = 50
+"""Samples of an item of others' code, about: few, since each step of a plant may take a second."""
 Progress = Callable[[int, str, str], None]
 """Called with the plant samples done, what is done in words, and a line about an event, or ""."""
 
@@ -165,7 +165,12 @@ def _measure_all(
     n_done = 0
     total = len(named) * noise.samples
     with reporting(progress, scenario.name, total) as report:
-        for key, result in done(items, jobs, scheduler):
+
+        def show(samples_at_work: int) -> None:
+            n_samples = n_done + samples_at_work
+            report(n_samples, f"{n_samples / total:.0%}", "")
+
+        for key, result in done(items, jobs, scheduler, show):
             # A mean over fewer seeds would be another figure under the same name.
             if isinstance(result, Failure):
                 raise result.error()
@@ -173,7 +178,7 @@ def _measure_all(
             measured[name].indicators.update(result.indicators)
             measured[name].timing.update(result.timing)
             n_done += items[key].noise.samples
-            report(n_done, f"{n_done / total:.0%}", "")
+            show(0)
     columns = {}
     timing = {}
     for name, measurement in measured.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -14,7 +15,7 @@ from cosim.core.protocols import Controller, Vector
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import measure, simulate
 from cosim.plant import FmuPlant
-from cosim.workers import Failure, Item, perform
+from cosim.workers import Failure, Item, SamplesDone, perform
 
 PROBE_STEPS = 10
 """Samples of the first run that shows how long a sample takes."""
@@ -83,18 +84,35 @@ class MeasureItem(Item[Measured]):
     theta: tuple[float, ...] = ()
     plant: Scenario | None = None
 
-    def run(self) -> Measured:
-        """Simulate every seed."""
+    def run(self, progress: SamplesDone) -> Measured:
+        """Simulate every seed.
+
+        Args:
+            progress: called each second or so with the samples so far.
+        """
         noise = self.noise
         controller = self._built()
         measured = Measured()
         scenario = self.plant or self.conditions.scenario
         with FmuPlant(scenario) as plant:
             if noise.whole:
-                run = simulate(plant, controller, noise.steps, noise.seeds[0])
+                run = simulate(
+                    plant,
+                    controller,
+                    noise.steps,
+                    noise.seeds[0],
+                    progress=progress,
+                )
                 return Measured(trajectory=run.to_csv())
-            for seed in noise.seeds:
-                indicators, timing = measure(plant, controller, seed, noise.steps, noise.burn_in)
+            for number, seed in enumerate(noise.seeds):
+                indicators, timing = measure(
+                    plant,
+                    controller,
+                    seed,
+                    noise.steps,
+                    noise.burn_in,
+                    progress=partial(_after, number * noise.length, progress),
+                )
                 measured.indicators[seed] = indicators
                 measured.timing[seed] = timing
         return measured
@@ -151,6 +169,17 @@ class MeasureItem(Item[Measured]):
         # By the length of the whole work, so that its parts have the same digits.
         compile_functions(controller, self.length)
         return controller
+
+
+def _after(before: int, progress: SamplesDone, samples: int) -> None:
+    """Report the samples of a run that follows others.
+
+    Args:
+        before: samples of the runs before.
+        progress: what is called with all of them.
+        samples: of the run.
+    """
+    progress(before + samples)
 
 
 _kept_nmpc: dict[str, tuple[RtiNmpc, Vector]] = {}

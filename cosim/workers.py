@@ -6,17 +6,22 @@ import logging
 import os
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, Self, TypeVar
 
+import numpy as np
+
 from cosim.core.errors import EvaluationError
+from cosim.core.files import temporary_folder
 from cosim.core.modules import OURS, import_folders, import_from
 from cosim.core.processes import Terminated, follow_parent, without_interrupts
 from cosim.core.scenario import Scenario, is_file
@@ -29,6 +34,10 @@ WORKER_SECONDS = 300.0
 """Time for which a cluster may be without a worker while there is work."""
 ROUNDS = 3
 """Times that workers may die without having finished one item."""
+LOOK_SECONDS = 1.0
+"""Seconds between two looks at how far workers have come."""
+SamplesDone = Callable[[int], None]
+"""Called with a number of plant samples."""
 Key = TypeVar("Key", bound=Hashable)
 Outcome = TypeVar("Outcome")
 
@@ -131,8 +140,12 @@ class Item(Generic[Outcome]):
 
     conditions: Conditions
 
-    def run(self) -> Outcome:
-        """Do the work."""
+    def run(self, progress: SamplesDone) -> Outcome:
+        """Do the work.
+
+        Args:
+            progress: called now and then with the item's plant samples so far.
+        """
         raise NotImplementedError
 
 
@@ -149,15 +162,38 @@ class Report(Generic[Outcome]):
     result: Outcome | Failure
 
 
-def perform(item: Item[Outcome]) -> Report[Outcome]:
-    """Do an item in this process; any exception, `sys.exit` too, becomes a Failure."""
+def ignored(samples: int) -> None:
+    """A `SamplesDone` that nobody follows."""
+
+
+def _paced(progress: SamplesDone) -> SamplesDone:
+    """The same, called at most as often as somebody looks."""
+    called_at = time.perf_counter()
+
+    def call(samples: int) -> None:
+        nonlocal called_at
+        now = time.perf_counter()
+        if now - called_at >= LOOK_SECONDS / 2:
+            called_at = now
+            progress(samples)
+
+    return call
+
+
+def perform(item: Item[Outcome], progress: SamplesDone = ignored) -> Report[Outcome]:
+    """Do an item in this process; any exception, `sys.exit` too, becomes a Failure.
+
+    Args:
+        item: the work.
+        progress: called now and then with the item's plant samples so far.
+    """
     facts: Mapping[str, str] = {}
     try:
         facts = item.conditions.facts_here()
         refusal = item.conditions.refusal(facts)
         if refusal is not None:
             return Report(facts, refusal)
-        result = item.run()
+        result = item.run(_paced(progress))
         # Data files and plug-ins may have been edited meanwhile.
         return Report(item.conditions.facts_here(), result)
     except (KeyboardInterrupt, Terminated):
@@ -183,6 +219,7 @@ def done(
     items: Mapping[Key, Item[Outcome]],
     jobs: int,
     scheduler: str | None,
+    progress: SamplesDone = ignored,
 ) -> Iterator[tuple[Key, Outcome | Failure]]:
     """Do items; yield the key of each with its result as it ends, in no certain order.
 
@@ -193,6 +230,8 @@ def done(
         items: the items by key.
         jobs: worker processes; 1 works in this process.
         scheduler: address of a Dask scheduler, used in place of `jobs`.
+        progress: called each second or so with the plant samples of the items that are not done
+            yet; never by the workers of a scheduler.
 
     Yields:
         The key of an item, and its result or its failure.
@@ -206,7 +245,7 @@ def done(
     while remaining:
         fruitless += 1
         try:
-            with closing(_reports(remaining, jobs, scheduler)) as reports:
+            with closing(_reports(remaining, jobs, scheduler, progress)) as reports:
                 for key, report in reports:
                     item = remaining.pop(key)
                     fruitless = 0
@@ -239,14 +278,48 @@ def begin_worker(parent: int) -> None:
     follow_parent(parent)
 
 
-def _with_key(key: Key, item: Item[Outcome]) -> tuple[Key, Report[Outcome]]:
-    return key, perform(item)
+class _Board:
+    """How far the workers of this machine have come: a number of samples for each item, in a file.
+
+    Args:
+        path: of the file.
+        n_items: number of the items.
+    """
+
+    def __init__(self, path: Path, n_items: int) -> None:
+        self.path = path
+        self._samples = np.memmap(path, np.int64, "w+", shape=n_items)
+
+    def total(self) -> int:
+        """Samples of all items that are not cleared."""
+        return int(self._samples.sum())
+
+    def clear(self, number: int) -> None:
+        """Forget the samples of an item, which is done."""
+        self._samples[number] = 0
+
+
+def _write_on_board(path: Path, number: int, samples: int) -> None:
+    """Say how far an item has come, in a worker."""
+    # A view that nobody follows must not end the work.
+    with suppress(OSError, ValueError), path.open("r+b") as board:
+        board.seek(8 * number)
+        board.write(np.int64(samples).tobytes())
+
+
+def _with_key(
+    key: Key,
+    item: Item[Outcome],
+    progress: SamplesDone = ignored,
+) -> tuple[Key, Report[Outcome]]:
+    return key, perform(item, progress)
 
 
 def _reports(
     items: Mapping[Key, Item[Outcome]],
     jobs: int,
     scheduler: str | None,
+    progress: SamplesDone,
 ) -> Generator[tuple[Key, Report[Outcome]], None, None]:
     """Reports of items by key, in no certain order."""
     if scheduler is not None:
@@ -255,8 +328,20 @@ def _reports(
     if jobs == 1:
         # A list: the caller removes each item as it is done.
         for key, item in list(items.items()):
-            yield _with_key(key, item)
+            yield _with_key(key, item, progress)
         return
+    with temporary_folder("cosim-progress-") as folder:
+        board = _Board(folder / "samples", len(items))
+        yield from _in_processes(items, jobs, board, progress)
+
+
+def _in_processes(
+    items: Mapping[Key, Item[Outcome]],
+    jobs: int,
+    board: _Board,
+    progress: SamplesDone,
+) -> Generator[tuple[Key, Report[Outcome]], None, None]:
+    """Reports of items that processes of this machine do."""
     import loky  # noqa: PLC0415 - a third of a second, which work in this process need not take
 
     # The workers are as many as the cores: more threads would wait for each other.
@@ -272,13 +357,24 @@ def _reports(
         env=one_thread,
     )
     try:
-        futures = []
+        numbers: dict[Any, int] = {}
         # The workers start with the first item that is given out.
         with without_interrupts():
-            for key, item in items.items():
-                futures.append(workers.submit(_with_key, key, item))
-        for future in loky.as_completed(futures):
-            yield future.result()
+            for number, (key, item) in enumerate(items.items()):
+                tell = partial(_write_on_board, board.path, number)
+                future = workers.submit(_with_key, key, item, tell)
+                numbers[future] = number
+        running = set(numbers)
+        while running:
+            ended, running = loky.wait(
+                running,
+                timeout=LOOK_SECONDS,
+                return_when=loky.FIRST_COMPLETED,
+            )
+            for future in ended:
+                board.clear(numbers[future])
+                yield future.result()
+            progress(board.total())
     finally:
         workers.shutdown(wait=True, kill_workers=True)
 

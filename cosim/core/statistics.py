@@ -11,6 +11,7 @@ from math import floor, isfinite, log10, nan
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri, stdtrit
 
 from cosim.core.protocols import Array
@@ -95,7 +96,7 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
     if _all_equal(without_one, value):
         return value, value
 
-    def quotients(drawn: Array) -> Array:
+    def quotients(drawn: NDArray[Any]) -> Any:
         return np.mean(numerator[drawn], axis=-1) / np.mean(denominator[drawn], axis=-1)
 
     every_seed = np.arange(seeds)
@@ -111,7 +112,7 @@ def _all_equal(values: Array, level: float) -> bool:
     return bool(np.ptp(values) <= NEGLIGIBLE * scale)
 
 
-def _resample(data: Sequence[Array], statistic: Callable[..., Array]) -> Array:
+def _resample(data: Sequence[NDArray[Any]], statistic: Callable[..., Any]) -> Array:
     """A statistic of data that are drawn anew with replacement, (RESAMPLES,), with a fixed seed.
 
     The draws are those of `scipy.stats.bootstrap`, whose import takes most of a second.

@@ -27,14 +27,15 @@ from cosim.core.modules import UNKNOWN
 from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario
 from cosim.core.training_options import CHECKPOINT, LOG, PARAMETERS, TrainingOptions
-from cosim.evaluation import EVALUATION, TIMING, Progress
+from cosim.evaluation import EVALUATION, ITEM_SAMPLES, TIMING, Progress
 from cosim.identity import changed, file_hash
 from cosim.measurement import Factory, Measured, MeasureItem, Noise
-from cosim.workers import Conditions, Failure, Item, done
+from cosim.workers import Conditions, Failure, Item, SamplesDone, done
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from learning.log import LogRow
     from learning.training_run import TrainingRun
 
 RUNS_FOLDER = "runs"
@@ -80,7 +81,10 @@ TYPES: dict[str, Any] = {
 }
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 SAMPLES_OF_ITEM = 20_000
-"""Samples of an item of an evaluation, about: some seconds where nothing is compiled."""
+"""Samples of an item of an evaluation, about: some seconds where nothing is compiled.
+
+Where code of others runs it is `cosim.evaluation.ITEM_SAMPLES`.
+"""
 PAUSE = 20
 """Least time between two writes of the tables, in multiples of the time that one takes."""
 TRAINING = ""
@@ -300,8 +304,12 @@ class TrainItem(Item[Trained]):
     training: TrainingJob
     folder: Path | None
 
-    def run(self) -> Trained:
-        """Train, from the checkpoint if there is one."""
+    def run(self, progress: SamplesDone) -> Trained:
+        """Train, from the checkpoint if there is one.
+
+        Args:
+            progress: called with the samples so far at each row of the log, in operation never.
+        """
         clock = time.perf_counter()
         training = self.training
         with temporary_folder("cosim-training-") as folder:
@@ -315,7 +323,7 @@ class TrainItem(Item[Trained]):
             if training.marks:
                 trained = _train_in_operation(run, training.marks)
             else:
-                trained = _train_in_episodes(run, self.folder or folder)
+                trained = _train_in_episodes(run, self.folder or folder, progress)
         return replace(trained, wall_seconds=time.perf_counter() - clock)
 
 
@@ -336,13 +344,17 @@ def _train_in_operation(run: TrainingRun, marks: Sequence[int]) -> Trained:
     )
 
 
-def _train_in_episodes(run: TrainingRun, folder: Path) -> Trained:
+def _train_in_episodes(run: TrainingRun, folder: Path, progress: SamplesDone) -> Trained:
     """Train as `cosim train` does it, with the checkpoint in a folder."""
     from learning.log import to_csv  # noqa: PLC0415
     from learning.training import run_training  # noqa: PLC0415
 
     has_checkpoint = (folder / CHECKPOINT).is_file()
-    result = run_training(run, folder, resume=has_checkpoint)
+
+    def show(samples: int, row: LogRow) -> None:
+        progress(samples)
+
+    result = run_training(run, folder, resume=has_checkpoint, progress=show)
     last_row = result.rows[-1]
     return Trained(
         log=to_csv(result.rows),
@@ -547,7 +559,8 @@ class RunStore:
             if not missing_seeds:
                 continue
             # Long enough to be worth its way to a worker, short enough to share the work evenly.
-            seeds_of_an_item = max(1, SAMPLES_OF_ITEM // noise.length)
+            n_samples = SAMPLES_OF_ITEM if run.conditions.all_ours else ITEM_SAMPLES
+            seeds_of_an_item = max(1, n_samples // noise.length)
             evaluation = self._evaluation(file, missing)
             for part in evaluation.parts(seeds_of_an_item):
                 yield file, part
@@ -718,7 +731,7 @@ class Runner:
         try:
             # What a training leaves to evaluate is found once it is done.
             while items := self._items(shared_disk=scheduler is None):
-                for key, result in done(items, jobs, scheduler):
+                for key, result in done(items, jobs, scheduler, self._show):
                     if isinstance(result, Failure):
                         self._note_failure(key.run, result)
                     else:
@@ -765,14 +778,23 @@ class Runner:
             line = _end_of_run(key.run, store)
         self._tell(line)
 
-    def _tell(self, line: str) -> None:
-        """Report the state of all runs, and a line on an event."""
+    def _show(self, samples_at_work: int) -> None:
+        """Report how far the items at work have come."""
+        self._tell("", samples_at_work)
+
+    def _tell(self, line: str, samples_at_work: int = 0) -> None:
+        """Report the state of all runs, and a line on an event.
+
+        Args:
+            line: on the event; empty where there is none.
+            samples_at_work: samples of the items that are not done.
+        """
         stores = self.stores.values()
         n_complete = sum(store.complete for store in stores)
         state = f"{n_complete}/{len(stores)} runs"
         if self.failures:
             state += f", {len(self.failures)} failed"
-        samples_done = sum(store.done for store in stores)
+        samples_done = samples_at_work + sum(store.done for store in stores)
         self._report(samples_done, state, line)
 
 

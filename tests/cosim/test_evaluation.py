@@ -9,7 +9,7 @@ from cosim import FmuPlant, evaluate, simulate
 from cosim.core.errors import EvaluationError
 from cosim.workers import done
 from tests.helpers.loop import Proportional, hold, proportional
-from tests.helpers.workers import LEDGER, always_dying, mortal, noting
+from tests.helpers.workers import LEDGER, always_dying, mortal, noting, sluggish
 
 BOTH = {"proportional": proportional, "hold": hold}
 
@@ -72,7 +72,23 @@ def test_few_samples_of_others_code_are_work_for_more_than_one_worker(paper, mon
 
     monkeypatch.setattr("cosim.evaluation.done", noting_items)
     evaluate(paper, {"hold": hold}, 8, 50)
-    assert [key for key in given if key[0] == "hold"] == [("hold", 0), ("hold", 4)]
+    assert [key for key in given if key[0] == "hold"] == [("hold", k) for k in range(8)]
+
+
+def test_progress_is_shown_within_a_run(paper, monkeypatch):
+    monkeypatch.setattr("cosim.workers.LOOK_SECONDS", 0.0)
+    shown = []
+    evaluate(paper, {"hold": hold}, 2, 1000, progress=lambda n, *_: shown.append(n))
+    assert {500, 1000, 1500} < set(shown) and shown == sorted(shown)
+    # Those of the optimum with them, whose J is J*.
+    assert shown[-1] == 4000
+
+
+@pytest.mark.slow
+def test_workers_say_how_far_they_are_within_a_run(paper):
+    shown = []
+    evaluate(paper, {"sluggish": sluggish}, 2, 150, jobs=2, progress=lambda n, *_: shown.append(n))
+    assert any(0 < n < 150 for n in shown)
 
 
 def test_every_evaluation_computes_and_writes_its_tables(paper, tmp_path, ledger):

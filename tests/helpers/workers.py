@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -50,3 +51,13 @@ class Dying(Proportional):
 
 def always_dying(scenario):
     return Dying(scenario)
+
+
+class Sluggish(Proportional):
+    def feedback(self, s, a=None):
+        time.sleep(0.02)
+        return super().feedback(s, a)
+
+
+def sluggish(scenario):
+    return Sluggish(scenario)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -13,7 +12,7 @@ from controllers import ConvergedNmpc, RtiNmpc, compile_functions
 from cosim.core.plugins import ControllerSource
 from cosim.core.protocols import Controller, Vector
 from cosim.core.scenario import Scenario
-from cosim.core.simulation import measure, simulate
+from cosim.core.simulation import after, measure, simulate
 from cosim.plant import FmuPlant
 from cosim.workers import Failure, Item, SamplesDone, perform
 
@@ -111,7 +110,7 @@ class MeasureItem(Item[Measured]):
                     seed,
                     noise.steps,
                     noise.burn_in,
-                    progress=partial(_after, number * noise.length, progress),
+                    progress=after(number * noise.length, progress),
                 )
                 measured.indicators[seed] = indicators
                 measured.timing[seed] = timing
@@ -169,17 +168,6 @@ class MeasureItem(Item[Measured]):
         # By the length of the whole work, so that its parts have the same digits.
         compile_functions(controller, self.length)
         return controller
-
-
-def _after(before: int, progress: SamplesDone, samples: int) -> None:
-    """Report the samples of a run that follows others.
-
-    Args:
-        before: samples of the runs before.
-        progress: what is called with all of them.
-        samples: of the run.
-    """
-    progress(before + samples)
 
 
 _kept_nmpc: dict[str, tuple[RtiNmpc, Vector]] = {}

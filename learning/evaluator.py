@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import inf, isfinite, nan
 from typing import Any
 
@@ -10,7 +11,9 @@ import numpy as np
 from controllers import compile_functions
 from controllers.estimator import measured
 from controllers.factories import nmpc
+from controllers.functions import switch
 from controllers.problem import Problem
+from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim.core.protocols import Array, Controller, Plant
 from cosim.core.simulation import indicators_of
@@ -19,6 +22,9 @@ from cosim.core.training_options import HELD_OUT
 from learning.log import METRICS
 from learning.training_run import TrainingRun
 from learning.verdict import cost_difference
+
+KnownCosts = dict[tuple[Any, ...], dict[str, Array]]
+"""Indicators on held-out noise, (K,) each, by what they depend on."""
 
 
 class Evaluator:
@@ -31,11 +37,16 @@ class Evaluator:
         plant: of its scenario.
         start: θ where the run starts.
         optimum: its J on the same seeds is J*; None: unknown.
+        known: what earlier runs of this process have found of naive and start, and where this one
+            puts it; runs of a study often start alike.
+        progress: called each second or so with the plant samples so far.
 
     Attributes:
         start: what `evaluate` says of the start.
         baselines: J of naive and, where it is known, optimal.
         limit: greedy J above which a run has diverged.
+        n_baselines: number of controllers evaluated before the first sample: naive, optimum, start.
+        samples: plant samples taken so far.
     """
 
     def __init__(
@@ -44,31 +55,38 @@ class Evaluator:
         plant: Plant,
         start: Parameters,
         optimum: Controller | None,
+        known: KnownCosts | None = None,
+        progress: Callable[[int], None] | None = None,
     ) -> None:
         self._run = run
         self._plant = plant
+        self._known = {} if known is None else known
+        self._progress = progress
+        self._controller: RtiNmpc | None = None
+        self.samples = 0
+        self.n_baselines = 0
         self.baselines: dict[str, float] = {}
         if not run.evaluation_seeds:
             self.start = _nothing_known()
             self.limit = inf
             return
-        scenario = run.scenario
-        self._controller = nmpc(scenario, start, run.controller)
-        self._law = measured(scenario, self._controller)
-
         # All that a training is compared with meets the same noise.
-        problem = Problem.from_scenario(scenario)
-        naive = nmpc(scenario, Parameters.naive(problem), run.controller)
-        naive_law = measured(scenario, naive)
-        naive_costs = self._costs(naive_law)
+        naive = Parameters.naive(Problem.from_scenario(run.scenario))
+        naive_costs = self._costs_at(naive)
         self.baselines["naive"] = float(naive_costs["J"].mean())
+        self.n_baselines = 1
         self._optimal_costs = np.full(run.evaluation_seeds, np.nan)
         if optimum is not None:
             self._optimal_costs = self._costs(optimum)["J"]
             self.baselines["optimal"] = float(self._optimal_costs.mean())
-        start_costs = self._costs(self._law)
+            self.n_baselines += 1
+        start_costs = self._costs_at(start)
+        # Of one θ there is one evaluation.
+        if self._key(start) != self._key(naive):
+            self.n_baselines += 1
         self._start_costs = start_costs["J"]
         self.start = self._metrics(start_costs)
+        self._start = start
         self._theta = start.theta
         self._evaluation = self.start
 
@@ -91,8 +109,7 @@ class Evaluator:
             return self.start
         # A training ends with the θ of its last row, and a rule may leave θ as it is.
         if not np.array_equal(theta, self._theta):
-            self._controller.theta = theta
-            costs = self._costs(self._law)
+            costs = self._costs(self._law_at(theta))
             self._evaluation = self._metrics(costs)
             self._theta = theta.copy()
         return self._evaluation
@@ -118,6 +135,36 @@ class Evaluator:
             "gap_closed": number_if_known(gap.value),
         }
 
+    def _law_at(self, theta: Array) -> Controller:
+        """The run's controller at θ (n_θ,), behind the estimator if there is one."""
+        if self._controller is None:
+            self._controller = nmpc(self._run.scenario, self._start, self._run.controller)
+            self._law = measured(self._run.scenario, self._controller)
+        self._controller.theta = theta
+        return self._law
+
+    def _key(self, parameters: Parameters) -> tuple[Any, ...]:
+        """What the costs at a θ depend on."""
+        run = self._run
+        return (
+            run.scenario.hash,
+            run.controller,
+            run.evaluation_seeds,
+            run.evaluation_steps,
+            # Compiled and interpreted controllers differ in the last digits.
+            switch(),
+            parameters.blocks.labels,
+            parameters.theta.tobytes(),
+        )
+
+    def _costs_at(self, parameters: Parameters) -> dict[str, Array]:
+        """Indicators at a θ, (K,) each; those that are known are not measured again."""
+        key = self._key(parameters)
+        if key not in self._known:
+            controller = nmpc(self._run.scenario, parameters, self._run.controller)
+            self._known[key] = self._costs(measured(self._run.scenario, controller))
+        return self._known[key]
+
     def _costs(self, policy: Controller) -> dict[str, Array]:
         """Indicators of a controller on the held-out seeds, (K,) each."""
         run = self._run
@@ -125,7 +172,20 @@ class Evaluator:
         # All runs together say whether compiling pays.
         n_samples = run.evaluation_steps * run.evaluation_seeds
         compile_functions(policy, n_samples)
-        return indicators_of(self._plant, policy, seeds, run.evaluation_steps)
+        costs = indicators_of(
+            self._plant,
+            policy,
+            seeds,
+            run.evaluation_steps,
+            progress=self._show,
+        )
+        self.samples += n_samples
+        return costs
+
+    def _show(self, samples: int) -> None:
+        """Report the samples of the present evaluation, which are not counted yet."""
+        if self._progress is not None:
+            self._progress(self.samples + samples)
 
 
 def number_if_known(value: float) -> float | None:

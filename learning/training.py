@@ -39,15 +39,16 @@ from cosim.core.training_options import (
     with_training_options,
 )
 from cosim.plant import FmuPlant
+from cosim.plant.fmi import SHIPPED_FMUS
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
-from learning.evaluator import Evaluator, number_if_known
+from learning.evaluator import Evaluator, KnownCosts, number_if_known
 from learning.log import LOG_COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
-from learning.training_run import TrainingRun, begin_training, make_run
+from learning.training_run import TrainingRun, begin_training, make_run, most_evaluations
 from learning.verdict import NO_DIFFERENCE, WORSE, Verdict, verdict
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ TRAINING_FILES = (
     "training.rrd",
 )  # fmt: skip
 """Files of a training; all in a folder belong to one run."""
+PAUSE = 20
+"""Least time between two checkpoints of another's FMU, in multiples of the time that one takes."""
 REMARKS = {
     "J": "J",
     "greedy_J": "greedy J",
@@ -83,6 +86,7 @@ class Training(Result):
         start: the first θ.
         start_J: its greedy J on that noise.
         baselines: J of `naive` and, where known, `optimal` on the same noise.
+        n_baselines: number of controllers that were evaluated before the first sample.
         predicted_cost: what the rule expects θ to cost, mean per sample; NaN of a rule without a
             prediction.
         changes: how often the rule has detected that the plant is another one; None where it does
@@ -102,6 +106,7 @@ class Training(Result):
     start: Parameters
     start_J: float
     baselines: Mapping[str, float]
+    n_baselines: int
     predicted_cost: float = float("nan")
     changes: int | None = None
     functions: str | None = None
@@ -172,7 +177,7 @@ class Training(Result):
     def held_out_samples(self) -> int:
         """Plant samples of the held-out runs, beside those of the training."""
         run = self.run
-        evaluations = len(self.baselines) + 1
+        evaluations = self.n_baselines
         theta = self.start.theta
         for row in self.rows[1:]:
             was_evaluated = not isnan(row["greedy_J"])
@@ -413,6 +418,7 @@ def run_training(
     optimum: str | None = None,
     progress: Callable[[int, LogRow], None] | bool = False,
     rule: type[Algorithm] | None = None,
+    known: KnownCosts | None = None,
 ) -> Training:
     """Train as `run` says.
 
@@ -427,6 +433,7 @@ def run_training(
         optimum: controller whose J is J*; without it regret and gap closed are unknown.
         progress: as in `train`.
         rule: the algorithm's class where it is not to be looked up by its name.
+        known: costs that runs of one process have in common, as in `Evaluator`.
     """
     clock = time.perf_counter()
     if hasattr(progress, "start"):
@@ -453,10 +460,34 @@ def run_training(
         else:
             # Without a folder, too: it restarts the solver, and no digit may depend on a folder.
             session.checkpoint()
-        evaluator = Evaluator(run, evaluation_plant, session.start, best)
-        with reporting(progress, run.algorithm, run.samples, _Remark()) as report:
-            # A function of the user's gets the rows of the log, a bar moves between them.
-            status = session.run_to_the_end(evaluator, report, between=progress is True)
+        # A function of the user's gets the rows of the log. A bar moves between them, and over the
+        # held-out runs, too.
+        is_bar = progress is True
+        total = run.samples
+        if is_bar and run.evaluation_seeds:
+            evaluations = most_evaluations(run.samples, run.evaluate_every)
+            total += evaluations * run.evaluation_seeds * run.evaluation_steps
+        with reporting(progress, run.algorithm, total, _Remark()) as report:
+
+            def show_held_out(samples: int) -> None:
+                report(session.loop.counts.number + samples, {})
+
+            evaluator = Evaluator(
+                run,
+                evaluation_plant,
+                session.start,
+                best,
+                known,
+                show_held_out if is_bar else None,
+            )
+
+            def show(samples: int, row: LogRow) -> None:
+                report(samples + evaluator.samples, row)
+
+            status = session.run_to_the_end(evaluator, show if is_bar else report, between=is_bar)
+            # Held-out runs of the same θ were left out.
+            if is_bar:
+                report(total, session.rows[-1])
         learned = session.loop.parameters
         training = Training(
             run=run,
@@ -469,6 +500,7 @@ def run_training(
             start=session.start,
             start_J=evaluator.start["J"],
             baselines=evaluator.baselines,
+            n_baselines=evaluator.n_baselines,
             predicted_cost=float(getattr(session.loop.algorithm, "predicted_cost", nan)),
             changes=getattr(session.loop.algorithm, "changes", None),
             functions=functions_of(session.loop.law),
@@ -486,7 +518,7 @@ def run_training(
 class _Remark(dict[str, float]):
     """The last value of each column of the log, and the remark behind a bar made of them."""
 
-    def __call__(self, done: int, row: LogRow) -> tuple[int, str]:
+    def __call__(self, done: int, row: Mapping[str, float]) -> tuple[int, str]:
         # What a row does not measure stays as it was measured last.
         for name, value in row.items():
             if not isnan(value):
@@ -519,6 +551,7 @@ class _Session:
         self.costs: list[float] = []
         self.updates: list[Update] = []
         self.without_checkpoint: str | None = None
+        self._quiet_until = 0.0
 
     def run_to_the_end(
         self,
@@ -565,7 +598,7 @@ class _Session:
             if divergence is not None:
                 return divergence
             if last or number % run.checkpoint_every == 0:
-                self.checkpoint()
+                self.checkpoint(is_last=last)
             progress(number, row)
         return "finished"
 
@@ -635,16 +668,27 @@ class _Session:
         reason = f"greedy J = {shown(greedy)} exceeds {shown(limit)}"
         return f"diverged: {reason} at sample {int(row['samples'])}"
 
-    def checkpoint(self) -> None:
-        """Start the solver afresh, as a resumed run will, and write the files of the run so far."""
+    def checkpoint(self, *, is_last: bool = False) -> None:
+        """Start the solver afresh, as a resumed run will, and write the files of the run so far.
+
+        Args:
+            is_last: whether the run ends here. Before that the files of another's FMU, whose
+                checkpoints are close, wait until those before are a while old.
+        """
         self.loop.restart()
         if self.out is None:
+            return
+        begin = time.perf_counter()
+        is_fast = self.run.scenario.plant.fmu in SHIPPED_FMUS
+        if begin < self._quiet_until and not (is_fast or is_last):
             return
         # Nothing of another run may stay beside the files of this one.
         with staged(self.out, TRAINING_FILES) as stage:
             write_atomically(stage / LOG, to_csv(self.rows))
             self.loop.parameters.save(stage / PARAMETERS)
             self._save_state(stage / CHECKPOINT)
+        end = time.perf_counter()
+        self._quiet_until = end + PAUSE * (end - begin)
 
     def _save_state(self, path: Path) -> None:
         """Write what resuming needs, where the plant can say its state."""

@@ -62,6 +62,9 @@ HELD_OUT_SHARE = 10
 """Training samples per held-out sample, at least, on a plant that may be slow."""
 SHORTEST = 10
 """Samples of a held-out run that says something, at least."""
+SLOW_LOG_EVERY = 100
+"""Samples a row of the log and a checkpoint, where nothing else is asked for, on a plant that may
+be slow: what a stop loses is a minute at most where a step takes half a second."""
 
 
 @dataclass(frozen=True)
@@ -179,23 +182,32 @@ def make_run(
     if samples is None:
         samples = getattr(rule, "budget", DEFAULT_SAMPLES)
     _check_samples(samples)
-    options = _with_held_out_runs(_with_intervals(options), scenario, samples)
+    options = _with_intervals(options, is_fast=scenario.plant.fmu in SHIPPED_FMUS)
+    options = _with_held_out_runs(options, scenario, samples)
     return TrainingRun(algorithm, scenario, samples, settings, **vars(options))
 
 
-def _with_intervals(options: TrainingOptions) -> TrainingOptions:
-    """Options with each interval of log, evaluations and checkpoints; raises ConfigurationError."""
+def _with_intervals(options: TrainingOptions, *, is_fast: bool) -> TrainingOptions:
+    """Options with each interval of log, evaluations and checkpoints; raises ConfigurationError.
+
+    Args:
+        options: what was chosen.
+        is_fast: whether the plant is known to be fast. A rule by a clock would make the same
+            command give other digits: the solver starts afresh at a checkpoint.
+    """
     _check_options(options)
     log_every = options.log_every
     if log_every is None:
-        log_every = _fitting_log_interval(options.evaluate_every, options.checkpoint_every)
+        longest = LOG_EVERY if is_fast else SLOW_LOG_EVERY
+        log_every = _fitting_log_interval(options.evaluate_every, options.checkpoint_every, longest)
     # Near their default, on rows of the log.
     near_default = log_every * max(1, round(EVALUATE_EVERY / log_every))
+    checkpoint_every = near_default if is_fast else log_every
     return replace(
         options,
         log_every=log_every,
         evaluate_every=options.evaluate_every or near_default,
-        checkpoint_every=options.checkpoint_every or near_default,
+        checkpoint_every=options.checkpoint_every or checkpoint_every,
     )
 
 
@@ -214,8 +226,7 @@ def _with_held_out_runs(
     if scenario.plant.fmu in SHIPPED_FMUS or not options.evaluation_seeds:
         return replace(options, evaluation_steps=longest)
     assert options.evaluate_every is not None
-    # Of θ after so many samples; at the end, of the start, of naive, and of the optimum if known.
-    evaluations = (samples - 1) // options.evaluate_every + 4
+    evaluations = most_evaluations(samples, options.evaluate_every)
     n_runs = evaluations * options.evaluation_seeds
     held_out_samples = samples // HELD_OUT_SHARE
     steps = held_out_samples // n_runs
@@ -224,10 +235,24 @@ def _with_held_out_runs(
     return replace(options, evaluation_steps=min(steps, longest))
 
 
-def _fitting_log_interval(evaluate_every: int | None, checkpoint_every: int | None) -> int:
-    """Largest interval up to the default that divides the others where these are given."""
+def most_evaluations(samples: int, evaluate_every: int) -> int:
+    """Controllers that a training evaluates on held-out noise, at most.
+
+    They are θ after each interval and at the end, the start, naive, and the optimum if known.
+
+    Args:
+        samples: of the training.
+        evaluate_every: samples of an interval.
+    """
+    return (samples - 1) // evaluate_every + 4
+
+
+def _fitting_log_interval(
+    evaluate_every: int | None, checkpoint_every: int | None, longest: int
+) -> int:
+    """Largest interval up to the longest that divides the others where these are given."""
     together = gcd(evaluate_every or 0, checkpoint_every or 0)
-    interval = LOG_EVERY
+    interval = longest
     while together % interval:
         interval -= 1
     return interval

@@ -498,6 +498,7 @@ def indicators_of(
     controller: Controller,
     seeds: Sequence[int],
     steps: int,
+    progress: Callable[[int], None] | None = None,
 ) -> dict[str, Array]:
     """`indicators` of a controller on several seeds.
 
@@ -506,18 +507,36 @@ def indicators_of(
         controller: the feedback law.
         seeds: of the noise, S of them.
         steps: samples of each run.
+        progress: called each second or so with the samples of all runs so far.
 
     Returns:
         Values (S,) by name.
     """
     rows = []
-    for seed in seeds:
-        values, _ = measure(plant, controller, seed, steps)
+    for number, seed in enumerate(seeds):
+        before = number * steps
+        values, _ = measure(
+            plant,
+            controller,
+            seed,
+            steps,
+            progress=progress is not None and after(before, progress),
+        )
         rows.append(values)
     table = {}
     for name in rows[0]:
         table[name] = np.array([row[name] for row in rows])
     return table
+
+
+def after(before: int, progress: Callable[[int], None]) -> Callable[[int], None]:
+    """The `progress` of a run that follows others.
+
+    Args:
+        before: samples of the runs before.
+        progress: what is called with the samples of all.
+    """
+    return lambda samples: progress(before + samples)
 
 
 def input_effort(

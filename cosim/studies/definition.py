@@ -24,6 +24,11 @@ from learning.errors import ConfigurationError
 
 BASELINES = "baselines"
 """Group of the cases that figures show as lines to compare with."""
+LEAST_BETWEEN_POINTS = 50
+"""Samples between two greedy evaluations, at least, where a study does not say how many they are.
+
+Each of them takes some thousand samples of the plant.
+"""
 MOST_BETWEEN_ROWS = 500
 """Samples between two rows of a log, at most."""
 BETWEEN_CHECKPOINTS = 5000
@@ -423,6 +428,9 @@ class Study:
         """Options of a training that has the study's number of greedy evaluations."""
         curves = self.held_out(scenario)
         between_points = max(1, samples // self.table.curves.points)
+        # Of a short training nobody has asked for so many points.
+        if "points" not in self.table.curves.model_fields_set:
+            between_points = max(between_points, min(samples, LEAST_BETWEEN_POINTS))
         # Rows of the log up to a greedy evaluation, evenly.
         n_rows = -(-between_points // MOST_BETWEEN_ROWS)
         log_every = max(1, between_points // n_rows)

@@ -30,11 +30,13 @@ from cosim.core.training_options import CHECKPOINT, LOG, PARAMETERS, TrainingOpt
 from cosim.evaluation import EVALUATION, ITEM_SAMPLES, TIMING, Progress
 from cosim.identity import changed, file_hash
 from cosim.measurement import Factory, Measured, MeasureItem, Noise
+from cosim.plant.fmi import SHIPPED_FMUS
 from cosim.workers import Conditions, Failure, Item, SamplesDone, done
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from learning.evaluator import KnownCosts
     from learning.log import LogRow
     from learning.training_run import TrainingRun
 
@@ -354,7 +356,9 @@ def _train_in_episodes(run: TrainingRun, folder: Path, progress: SamplesDone) ->
     def show(samples: int, row: LogRow) -> None:
         progress(samples)
 
-    result = run_training(run, folder, resume=has_checkpoint, progress=show)
+    # The plant of a file may be replaced while this process lives.
+    known = _known_costs if run.scenario.plant.fmu in SHIPPED_FMUS else None
+    result = run_training(run, folder, resume=has_checkpoint, progress=show, known=known)
     last_row = result.rows[-1]
     return Trained(
         log=to_csv(result.rows),
@@ -366,6 +370,9 @@ def _train_in_episodes(run: TrainingRun, folder: Path, progress: SamplesDone) ->
         plant_samples=result.plant_samples,
     )
 
+
+_known_costs: KnownCosts = {}
+"""Costs of naive and of starts on held-out noise, which the runs of a process have in common."""
 
 # The folder of a run
 

@@ -7,7 +7,7 @@ whether a reset resets, whether a saved state is the whole state. A plant relies
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -314,12 +314,17 @@ class _Bench:
     """Instances to try, one at a time: a reset one where resets are known to work, else new ones.
 
     An FMU that can be instantiated only once per process has one in all.
+
+    Attributes:
+        instance: the present one; None before the first.
+        resets: whether resets are known to work.
+        handle: of the state that is saved of it.
     """
 
     def __init__(self, subject: Subject, experiment: Experiment) -> None:
         self._subject = subject
         self._experiment = experiment
-        self._instance: Instance | None = None
+        self.instance: Instance | None = None
         self._is_new = False
         self.resets = False
         self.handle = ctypes.c_void_p()
@@ -327,23 +332,23 @@ class _Bench:
     def start(self, *, by_reset: bool | None = None) -> Instance:
         """An initialised instance; `by_reset` forces how it is had."""
         reset = self.resets if by_reset is None else by_reset
-        if self._instance is None or not (self._is_new or reset):
+        if self.instance is None or not (self._is_new or reset):
             self.instantiate()
-        assert self._instance is not None
-        self._instance.initialise(started=not self._is_new)
+        assert self.instance is not None
+        self.instance.initialise(started=not self._is_new)
         self._is_new = False
-        return self._instance
+        return self.instance
 
     def instantiate(self) -> None:
         """Make a new instance, in place of the one before."""
         subject = self._subject
         fmu = subject.fmu
         once = fmu.description.coSimulation.canBeInstantiatedOnlyOncePerProcess
-        if self._instance is not None and once:
+        if self.instance is not None and once:
             raise _CannotStartAgainError("it has one instance per process, which does not reset")
         self.close()
         make_instance = interface(fmu)
-        self._instance = make_instance(
+        self.instance = make_instance(
             fmu,
             subject.exchanged,
             subject.starts,
@@ -356,9 +361,9 @@ class _Bench:
 
     def close(self) -> None:
         """Free the instance and what was saved of it."""
-        if self._instance is not None:
-            self._instance.close([self.handle])
-            self._instance = None
+        if self.instance is not None:
+            self.instance.close([self.handle])
+            self.instance = None
             self.handle = ctypes.c_void_p()
 
     def run(
@@ -438,6 +443,8 @@ GENTLE = 0.02
 """Share of the distance by which inputs vary where an FMU failed under the whole of it."""
 SHORT_STEP = 2.0**-14
 """A short step, as a share of a step: what is continuous has hardly moved."""
+SAVED_STEPS = 4
+"""Steps of a run in which a state is saved after the first one and set again after the last."""
 HARDLY = 0.05
 """How far an output may move in a short step, as a share of its move in a step."""
 
@@ -548,6 +555,8 @@ class Probe:
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self._open = (OutputKind.OPEN,) * len(subject.names[1])
+        # States and steps behind the saved state, once it is proven.
+        self._after_saving: tuple[tuple[float, ...], tuple[ProbedStep, ...]] = ((), ())
         self._vary_inputs(1.0)
 
     def _vary_inputs(self, share: float) -> None:
@@ -617,12 +626,24 @@ class Probe:
     ) -> Findings:
         """What the runs after a first one show; the first failure ends it."""
         seen = self._nothing_known(experiment)
+        looked: Sequence[ProbedStep] | None = None
         # A reset must repeat the first run to the bit, before any other run relies on it.
         try:
-            after_reset = bench.run(self._inputs, by_reset=True)
+            after_reset = bench.run(self._inputs, look=True, by_reset=True)
             bench.resets = _same(after_reset, first)
+            # Both is shown at once: each step of a plant may take a second.
+            if bench.resets:
+                looked = after_reset.samples
         except PlantError as error:
             seen = seen._replace(failure=str(error))
+        # The reset or the look is at fault.
+        if not bench.resets:
+            try:
+                after_reset = bench.run(self._inputs, by_reset=True)
+                bench.resets = _same(after_reset, first)
+                seen = seen._replace(failure="")
+            except PlantError as error:
+                seen = seen._replace(failure=str(error))
         # Each finding is kept as it is made: a later run may fail.
         try:
             if bench.resets:
@@ -636,7 +657,8 @@ class Probe:
                     line = "two new instances under the same actions give different numbers"
                     return seen._replace(failure=seen.failure or line)
             # FMI forbids it: an FMU may answer, and go on otherwise than it would have.
-            looked = bench.run(self._inputs, look=True).samples
+            if looked is None:
+                looked = bench.run(self._inputs, look=True).samples
             harmless = _same(looked, first.samples)
             seen = seen._replace(harmless=harmless)
             # A look that changes what follows says nothing of the FMU without it.
@@ -706,11 +728,7 @@ class Probe:
                 at_first = looked[0].looked[i] != other.samples[0].looked[i]
                 at_third = looked[2].looked[i] != late.samples[2].looked[i]
                 follows[i] = at_first and at_third
-        points = [self._point(bench, first, 0)]
-        # At the first sample an output may be what the initialisation left.
-        if self.subject.fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
-            points.append(self._point(bench, first, 2))
-        known_points = [point for point in points if point is not None]
+        known_points: list[Point] | None = None
         kinds = []
         for i, place in enumerate(output_places):
             acts = first.samples[0].outputs[i] != other.samples[0].outputs[i]
@@ -724,8 +742,19 @@ class Probe:
             elif not (acts or changes):
                 kinds.append(OutputKind.CONSTANT)
             else:
+                # A dozen steps, which other outputs do not need.
+                if known_points is None:
+                    known_points = self._points(bench, first)
                 kinds.append(_kind_of(i, known_points, acts, starts_alike))
         return tuple(kinds)
+
+    def _points(self, bench: _Bench, first: ProbedRun) -> list[Point]:
+        """Points of the run from which steps of other lengths were taken."""
+        points = [self._point(bench, first, 0)]
+        # At the first sample an output may be what the initialisation left.
+        if self.subject.fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
+            points.append(self._point(bench, first, 2))
+        return [point for point in points if point is not None]
 
     def _point(
         self,
@@ -838,28 +867,41 @@ class Probe:
         """Whether the stage cost is that of the sample's begin, ℓ(x_k, u_k, d_k), or may be."""
         return self.findings.kinds[0] is not OutputKind.END
 
-    @cached_property
+    @property
     def snapshots(self) -> str:
         """Why a saved state cannot be relied on; empty if it can."""
-        return self._tried(self._try_snapshot)
+        return self._faults_of_saving[0]
 
-    @cached_property
+    @property
     def serialises(self) -> str:
         """Why a serialised state cannot be relied on; empty if it can."""
-        return self.snapshots or self._tried(self._try_serialised)
+        return self._faults_of_saving[1]
 
-    def _tried(self, attempt: Callable[[_Bench], str]) -> str:
+    @cached_property
+    def _faults_of_saving(self) -> tuple[str, str]:
+        """Why a saved state cannot be relied on, and why a serialised one; empty if it can."""
         bench = _Bench(self.subject, self.findings.experiment)
         try:
             bench.instantiate()
-            return attempt(bench)
+            fault = self._try_snapshot(bench)
         except PlantError as error:
-            return str(error)
+            fault = str(error)
+        try:
+            # The same saved state: it was proven, and a step may take a second.
+            return fault, fault or self._try_serialised(bench)
+        except PlantError as error:
+            return fault, str(error)
         finally:
             bench.close()
 
-    def _saved(self, bench: _Bench) -> tuple[Instance, tuple[float, ...], tuple[ProbedStep, ...]]:
-        """Save after the first sample; the states then, and what followed."""
+    def _go_on_from_saved(self, bench: _Bench) -> tuple[ProbedStep, ...]:
+        """The steps after the first one, behind which the state is saved."""
+        assert bench.instance is not None
+        return bench.go_on(bench.instance, self._inputs[1:SAVED_STEPS], first=1)
+
+    def _try_snapshot(self, bench: _Bench) -> str:
+        # What the same steps give where nothing is saved.
+        without = bench.run(self._inputs[:SAVED_STEPS])
         fmi = bench.start()
         fmi.require_state()
         # From here on it may be taken back.
@@ -867,35 +909,28 @@ class Probe:
         bench.go_on(fmi, self._inputs[:1])
         states = tuple(fmi.states)
         fmi.save(bench.handle)
-        samples = self._go_on_from_saved(bench, fmi)
-        return fmi, states, samples
-
-    def _go_on_from_saved(self, bench: _Bench, fmi: Instance) -> tuple[ProbedStep, ...]:
-        """The steps after the first one, behind which the state is saved."""
-        return bench.go_on(fmi, self._inputs[1:], first=1)
-
-    def _try_snapshot(self, bench: _Bench) -> str:
-        # What the same steps give where nothing is saved.
-        without = bench.run(self._inputs)
-        fmi, states, samples = self._saved(bench)
+        samples = self._go_on_from_saved(bench)
         if not _same(samples, without.samples[1:]):
             return "while a state is saved the same steps give other numbers"
         fmi.load(bench.handle)
         if tuple(fmi.states) != states:
             return "a state that was saved and set again is another one"
         # What the FMU hides, its noise say, has to be in the saved state as well.
-        again = self._go_on_from_saved(bench, fmi)
+        again = self._go_on_from_saved(bench)
         if not _same(again, samples):
             return "after a state was saved and set again the same steps give other numbers"
+        self._after_saving = states, samples
         return ""
 
     def _try_serialised(self, bench: _Bench) -> str:
-        fmi, states, samples = self._saved(bench)
+        fmi = bench.instance
+        assert fmi is not None
+        states, samples = self._after_saving
         data = fmi.serialise(bench.handle)
         fmi.deserialise(data, bench.handle)
         fmi.load(bench.handle)
         is_there = tuple(fmi.states) == states
-        if not is_there or not _same(self._go_on_from_saved(bench, fmi), samples):
+        if not is_there or not _same(self._go_on_from_saved(bench), samples):
             return "after a state was serialised and set again the same steps give other numbers"
         return ""
 

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 
 from controllers.errors import ControllerError, ModelWarning, warn
 from cosim.core.files import cache_folder, lock, temporary_folder
-from cosim.core.processes import child_process
+from cosim.core.processes import child_process, processor_seconds
 from cosim.core.protocols import Matrix, Vector
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
@@ -351,7 +352,11 @@ FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared", "-fno-gcse-after-reload
 LONG = 1000
 """Least samples of a run for which a controller is compiled; libraries are kept."""
 PATIENCE = 120.0
-"""Seconds that a compiler may take."""
+"""Seconds of the processor that a compiler may take: what else the machine does must not matter."""
+HANGING = 1800.0
+"""Seconds after which a compiler hangs, whatever it does."""
+LOOK_SECONDS = 0.5
+"""Seconds between two looks at what a compiler has taken."""
 BUILDS = Path(__file__).with_name("builds.tar.xz")
 """Libraries of the presets' controllers and rollouts for five platforms, by `build_name`."""
 
@@ -430,7 +435,7 @@ def _make(
 ) -> None:
     """Take a library from `BUILDS`, else compile it; a note where the compiler fails."""
     note = path.with_suffix(".failed")
-    with lock(path.with_suffix(".lock"), PATIENCE):
+    with lock(path.with_suffix(".lock"), HANGING):
         # Another process may have tried in the meantime.
         if path.is_file() or note.is_file():
             return
@@ -476,10 +481,16 @@ def _compile(compiler: str, files: Mapping[str, bytes], folder: Path) -> str | N
     command = [compiler, *FLAGS, "-o", "library", *units, "-lm"]
     # A compiler that hangs must not hang the run: without a library the interpreter does.
     with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
-        try:
-            status = child.wait(PATIENCE)
-        except subprocess.TimeoutExpired:
-            return f"{compiler} took longer than {PATIENCE:g} s"
+        begin = time.monotonic()
+        status = None
+        while status is None:
+            try:
+                status = child.wait(LOOK_SECONDS)
+            except subprocess.TimeoutExpired:
+                if processor_seconds(child.pid) > PATIENCE:
+                    return f"{compiler} took longer than {PATIENCE:g} s of the processor"
+                if time.monotonic() - begin > HANGING:
+                    return f"{compiler} did not end in {HANGING:g} s"
     if status < 0:
         # It was ended from outside, for want of memory say: another time it may succeed.
         raise OSError(f"{compiler} was ended by signal {-status}")

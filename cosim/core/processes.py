@@ -182,6 +182,26 @@ def child_process(
         _end(child)
 
 
+def processor_seconds(process_id: int) -> float:
+    """Seconds of the processor that a process and its descendants have taken, 0 once it is gone.
+
+    Args:
+        process_id: of the process.
+    """
+    import psutil  # noqa: PLC0415
+
+    total = 0.0
+    try:
+        process = psutil.Process(process_id)
+        for one in (process, *process.children(recursive=True)):
+            # What a child took that has ended is its parent's, where the system counts it.
+            with suppress(psutil.NoSuchProcess):
+                total += sum(one.cpu_times()[:4])
+    except psutil.NoSuchProcess:
+        return 0.0
+    return total
+
+
 def _end(child: subprocess.Popen[bytes]) -> None:
     """Terminate a child and its descendants; kill them after two seconds."""
     import psutil  # noqa: PLC0415

@@ -119,10 +119,26 @@ def test_a_compiler_that_fails_or_hangs_leaves_nothing(folder, monkeypatch, tmp_
     hangs.write_text("#!/bin/sh\nsleep 600\n")
     hangs.chmod(0o700)
     monkeypatch.setenv("CC", str(hangs))
-    monkeypatch.setattr(functions, "PATIENCE", 0.5)
-    with pytest.warns(ModelWarning, match=r"took longer than 0\.5 s"):
+    monkeypatch.setattr(functions, "HANGING", 0.5)
+    with pytest.warns(ModelWarning, match=r"did not end in 0\.5 s"):
         assert answer(42) is None
     assert list(folder.glob("*.lib")) == []
+
+
+@pytest.mark.slow
+def test_a_compiler_may_wait_but_not_compute_for_long(folder, monkeypatch, tmp_path):
+    monkeypatch.setattr(functions, "PATIENCE", 1.0)
+    waits = tmp_path / "waits"
+    waits.write_text('#!/bin/sh\nsleep 2\nexec cc "$@"\n')
+    computes = tmp_path / "computes"
+    computes.write_text("#!/bin/sh\nwhile :; do :; done\n")
+    for script in (waits, computes):
+        script.chmod(0o700)
+    monkeypatch.setenv("CC", str(waits))
+    assert answer(43) is not None
+    monkeypatch.setenv("CC", str(computes))
+    with pytest.warns(ModelWarning, match=r"took longer than 1 s of the processor"):
+        assert answer(44) is None
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the compiler is a shell script")

@@ -15,6 +15,9 @@ from cosim.core.validation import instead
 
 VaryingKind = Literal["disturbance", "parameter", "price", "lower", "upper", "reference"]
 
+MODEL_KINDS: tuple[VaryingKind, ...] = ("disturbance", "parameter", "price")
+"""Kinds of what a signal gives of the model."""
+
 
 class Varying(NamedTuple):
     """A quantity that differs from stage to stage.
@@ -118,6 +121,17 @@ def _is_price(model: Model, index: int) -> bool:
     in_dynamics = ca.depends_on(rates, parameter)
     in_cost = ca.depends_on(cost, parameter)
     return bool(in_cost and not in_dynamics)
+
+
+def given_parameters(varying: Iterable[Varying], model: Model) -> tuple[str, ...]:
+    """Names of a model's parameters whose values signals give, so that θ cannot have them.
+
+    Args:
+        varying: All quantities.
+        model: The controller's model.
+    """
+    items = of_kind(varying, "parameter", "price")
+    return tuple(model.parameters[item.place].name for _, item in items)
 
 
 def of_kind(varying: Iterable[Varying], *kinds: VaryingKind) -> list[tuple[int, Varying]]:

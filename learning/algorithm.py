@@ -14,6 +14,7 @@ from cosim.core.modules import load_plugin
 from cosim.core.plugins import ALGORITHMS, registered
 from cosim.core.protocols import Vector
 from cosim.core.scenario import Penalty, Scenario
+from cosim.core.signals import Known
 from cosim.core.validation import suggestion
 from learning.checkpoint import State
 from learning.configuration import Configuration
@@ -43,6 +44,7 @@ class Transition(NamedTuple):
         y: what the sensors showed at s, (n_y,), NaN where nothing came; None without sensors.
         moved_penalty: penalty of the bounds as they are at s₊; None where no signal moves them.
         signal_cost: what known prices alone change of ℓ + V(s₊) − Q(s, a), at the reference.
+        known: what was known of the signals at s, by their names; None without signals.
     """
 
     number: int
@@ -61,6 +63,7 @@ class Transition(NamedTuple):
     y: Vector | None = None
     moved_penalty: Penalty | None = None
     signal_cost: float = 0.0
+    known: Known | None = None
 
 
 class Update(NamedTuple):

@@ -26,6 +26,7 @@ from pydantic import Field
 from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
+from controllers.varying import MODEL_KINDS, of_kind
 from cosim.core.protocols import Array
 from cosim.core.scenario import NonNegative, Positive
 from learning.checkpoint import State
@@ -146,27 +147,32 @@ def displaced(
 class Features:
     """The nominal model as a function of its parameters' errors c (p,), for K = n + 1 outputs.
 
-    The cost is the last output. Parameters are the model's and then its nominal disturbances.
+    The cost is the last output. Parameters are the model's and then its nominal disturbances. What
+    a known signal gives of the model, a disturbance, a parameter or a price, is an input v behind
+    the action, and its error c has no effect.
 
     Args:
         problem: has the nominal model.
         smallest_error_size: least h, as a share of its value at the reference.
 
     Attributes:
-        mean: CasADi function of (s, a, c): y (K,) and h (K,); h is that of c = 0.
-        n_inputs: n + m.
+        mean: CasADi function of (s, (a, v), c): y (K,) and h (K,); h is that of c = 0.
+        n_inputs: n + m + n_v, the entries of (s, a, v).
+        n_signals: n_v.
         n_outputs: K.
         n_parameters: p.
     """
 
     def __init__(self, problem: Problem, smallest_error_size: float = 0.1) -> None:
-        x, u, c, y = _with_errors(problem)
+        x, u, v, c, y = _with_errors(problem)
         n_parameters = len(problem.model.parameters)
         G = ca.jacobian(y, c)
         # h is that of c = 0: it must not move with what is fitted.
         by_disturbance = G[:, n_parameters:]
         no_errors = ca.DM.zeros(c.shape)
         at_nominal = ca.substitute(by_disturbance, c, no_errors)
+        # To the functions what signals give is no other than what actions do.
+        u = ca.vertcat(u, v)
         h = _error_sizes(problem, x, u, at_nominal, smallest_error_size)
         y = ca.densify(y)
         G = ca.densify(G)
@@ -179,7 +185,8 @@ class Features:
         self.mean = ca.Function("nominal", arguments, mean, names, ["y", "h"])
         self._function = ca.Function("features", arguments, features, names, ["y", "G", "h"])
         self.n_outputs, self.n_parameters = G.shape
-        self.n_inputs = problem.n_states + problem.n_actions
+        self.n_signals = v.numel()
+        self.n_inputs = problem.n_states + problem.n_actions + self.n_signals
         self.compiled: Any = None
         if not_in_c([self._function]) is None:
             self._compile(problem.n_states)
@@ -209,7 +216,7 @@ class Features:
         """The nominal model at many inputs.
 
         Args:
-            inputs: (s, a), (M, n+m).
+            inputs: (s, a, v), (M, n+m+n_v).
             c: errors of the parameters, (p,).
 
         Returns:
@@ -238,8 +245,8 @@ class Features:
         return y, G.reshape(shape_of_G), h
 
 
-def _with_errors(problem: Problem) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Symbols of x, u and the parameters' errors c, and the outputs y = (s₊, ℓ) as of these."""
+def _with_errors(problem: Problem) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Symbols of x, u, v and the parameters' errors c, and the outputs y = (s₊, ℓ) as of these."""
     model = problem.model
     x, u, d, p = model.symbols()
     simulate = discretise(model, problem.sampling_time, problem.substeps)
@@ -260,9 +267,17 @@ def _with_errors(problem: Problem) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         c[n_parameters:],
     )
     at_errors = ca.vertcat(parameters, *disturbances)
+    # What a signal gives is known, without an error.
+    given = of_kind(problem.varying, *MODEL_KINDS)
+    v = ca.SX.sym("v", len(given))
+    for i, (_, item) in enumerate(given):
+        place = item.place
+        if item.kind == "disturbance":
+            place += n_parameters
+        at_errors[place] = v[i]
     symbols = ca.vertcat(p, d)
     (y,) = ca.substitute([outputs], [symbols], [at_errors])
-    return x, u, c, y
+    return x, u, v, c, y
 
 
 def _error_sizes(
@@ -277,13 +292,15 @@ def _error_sizes(
     Args:
         problem: has the reference.
         x: symbol of the state.
-        u: symbol of the action.
+        u: symbol of the action and of what signals give, (a, v).
         by_disturbance: derivative of the outputs by the disturbances' errors, (K, n_d).
         smallest: least h, as a share of its value at the reference.
     """
     size = ca.sqrt(ca.sum2(by_disturbance**2))
     size_at = ca.Function("size", [x, u], [size])
-    at_reference = size_at(problem.reference_state, problem.reference_action)
+    given = [item.nominal for _, item in of_kind(problem.varying, *MODEL_KINDS)]
+    action_and_signals = np.concatenate([problem.reference_action, given])
+    at_reference = size_at(problem.reference_state, action_and_signals)
     references = at_reference.full()[:, 0]
     entries = ca.vertsplit(size)
     floored = []

@@ -422,7 +422,8 @@ class _OnALog(ModelBased):
         distance = self._problem.state_upper - self._problem.state_lower
         most = np.tile(settings.largest_back_off * distance, 2)
         kept = np.clip(self.back_off + shift, 0.0, most)
-        least = self.least_back_offs(kept, inputs)
+        bounds = self._signals.bounds(range(len(inputs)))
+        least = self.least_back_offs(kept, inputs, bounds)
         search = BackOffOnModel(
             self._problem,
             self._rollout,
@@ -431,6 +432,8 @@ class _OnALog(ModelBased):
             recent,
             settings,
             self.rng,
+            self._signals,
+            range(len(recent)),
         )
         best = search.best(kept, least, settings.back_off_levels)
         return search.theta(best)

@@ -15,7 +15,7 @@ from controllers.theta import Parameters
 from cosim.core.loop import ClosedLoop
 from cosim.core.protocols import Plant, Step, Vector
 from cosim.core.scenario import Penalty, Scenario
-from cosim.core.signals import signals_of
+from cosim.core.signals import Known, signals_of
 from cosim.plant import FmuPlant
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
@@ -108,6 +108,7 @@ class TrainingLoop:
         self._signal_costs = SignalCosts(controller.problem)
         # What known prices change of the present sample's cost, and of V.
         self._signal_changes = (0.0, 0.0)
+        self._known: Known | None = None
         self._loop = ClosedLoop(
             in_operation.step,
             self.law,
@@ -280,6 +281,7 @@ class TrainingLoop:
         sample = loop.step(a)
         self.counts.number = number + 1
         stage_change, value_change = self._signal_changes
+        known = self._known
         # The solution at s₊ serves the next sample too.
         self._solve()
         next_solution: RtiSolution | None = loop.solution
@@ -313,6 +315,7 @@ class TrainingLoop:
             y=sample.y,
             moved_penalty=self._moved_penalty(),
             signal_cost=stage_change + next_value_change - value_change,
+            known=known,
         )
         return transition, cost
 
@@ -352,8 +355,8 @@ class TrainingLoop:
     def _solve(self, *, prepare: bool = True) -> None:
         """Solve for V(s) and π(s) of the present state; a failure is counted."""
         if self.signals is not None:
-            known = self.signals.known(self._loop.number)
-            self._signal_changes = self._signal_costs.of_sample(known)
+            self._known = self.signals.known(self._loop.number)
+            self._signal_changes = self._signal_costs.of_sample(self._known)
         self.counts.failures += not self._loop.solve(prepare=prepare)
 
     def restart(self) -> None:

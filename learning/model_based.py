@@ -28,6 +28,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import ALL, Count, ModelParameters, Share
 from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
+from learning.known_signals import KnownSignals
 from learning.model_from_outputs import ModelFromOutputs
 from learning.plant_data import PlantData
 from learning.prediction_errors import SortedErrors, expected_penalties
@@ -183,6 +184,7 @@ class ModelBased(Algorithm):
     """
 
     learns_from_estimates = True
+    learns_under_signals = True
     under_sensors = ModelFromOutputs
     Configuration = ModelBasedConfiguration
     configuration: ModelBasedConfiguration
@@ -200,6 +202,7 @@ class ModelBased(Algorithm):
         self._carried = self._problem.model.parameter_indices(labels)
         self._rollout = Rollout(self._problem, start, self._features)
         self._data = PlantData(self._features, settings)
+        self._signals = KnownSignals(self.scenario, self._problem, settings.recent_samples)
         # A start that is backed off already is not given away.
         self.back_off: Array = self._back_offs(start)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
@@ -227,7 +230,7 @@ class ModelBased(Algorithm):
         """Keep a transition; move θ when an update is due."""
         # Every sample is kept; whether one calls for an update is asked once a window.
         data = self._data
-        data.add(transition)
+        self._keep(transition)
         model = data.model
         alarmed = False
         if model is not None and data.since_fit % self.configuration.change_windows[0] == 0:
@@ -238,7 +241,12 @@ class ModelBased(Algorithm):
 
     def watch(self, transition: Transition) -> None:
         """Keep a transition; θ stays."""
-        self._data.add(transition)
+        self._keep(transition)
+
+    def _keep(self, transition: Transition) -> None:
+        """Keep a transition, and what was known of the signals at its sample."""
+        self._signals.add(transition)
+        self._data.add(transition, self._signals.inputs_of(transition.known))
 
     def retreat(self) -> None:
         """Take the back-offs of the θ to which the loop has gone back; nothing is predicted."""
@@ -262,7 +270,15 @@ class ModelBased(Algorithm):
             return False
         predictions = self._data.predictions()
         expected = ExpectedCosts(self._problem, model, settings)
-        costs, _ = expected(predictions.outputs, predictions.h)
+        n_predicted = len(predictions.outputs)
+        numbers = self._data.latest_numbers(n_predicted)
+        inputs, _ = self._data.latest(n_predicted)
+        signals = self._signals_of(inputs)
+        # A sample's penalty is here that of the state to which it leads.
+        bounds = self._signals.bounds([number + 1 for number in numbers])
+        costs, _ = expected(predictions.outputs, predictions.h, bounds)
+        # What prices alone change no θ can help.
+        costs = costs - self._signals.price_costs(signals)
         # Costs by the model's expectation: realised penalties are too rare.
         too_costly = []
         if len(costs) > settings.settling_samples:
@@ -272,6 +288,11 @@ class ModelBased(Algorithm):
                     too_costly.append(window)
         changed = self._data.changed(predictions, too_costly)
         return changed or bool(too_costly)
+
+    def _signals_of(self, inputs: Array) -> Array:
+        """What signals give of the model in inputs (s, a, v), (M, n_v)."""
+        n_before = self._features.n_inputs - self._features.n_signals
+        return inputs[:, n_before:]
 
     def _update(self, alarmed: bool) -> Update:
         """Fit the model, search on it, and move θ where the model predicts less for the new one."""
@@ -299,12 +320,14 @@ class ModelBased(Algorithm):
 
         inputs, _ = data.present
         latest, _ = data.latest(settings.recent_samples)
+        latest_numbers = data.latest_numbers(settings.recent_samples)
         recent = inputs[-settings.recent_samples :]
         base, gained = self.corrected(present, model, recent)
         # What c_f and the parameters correct, back-offs need not hold any more.
         shift = np.concatenate([gained, -gained])
         kept = np.maximum(self.back_off + shift, 0.0)
-        least = self.least_back_offs(kept, inputs)
+        bounds = self._signals.bounds(data.latest_numbers(len(inputs)))
+        least = self.least_back_offs(kept, inputs, bounds)
         search = BackOffOnModel(
             self._problem,
             self._rollout,
@@ -313,6 +336,8 @@ class ModelBased(Algorithm):
             latest,
             settings,
             self.rng,
+            self._signals,
+            latest_numbers,
         )
         best = search.best(kept, least, levels)
 
@@ -324,7 +349,7 @@ class ModelBased(Algorithm):
         better = search.excess(cost_of_new, cost_of_present) <= -least_gain
         prediction = cost_of_new if better else cost_of_present
         self._limits = prediction.limits
-        self.predicted_cost = prediction.cost
+        self.predicted_cost = prediction.cost + prediction.price_cost
         if better:
             self.back_off = best
             self.controller.theta = new
@@ -366,7 +391,12 @@ class ModelBased(Algorithm):
                 return None
         return model
 
-    def least_back_offs(self, present: Array, inputs: Array) -> Array:
+    def least_back_offs(
+        self,
+        present: Array,
+        inputs: Array,
+        bounds: tuple[Array, Array],
+    ) -> Array:
         """Least back-offs that the data allow.
 
         A present one shrinks little beyond the state that came closest to its bound: what lies
@@ -376,7 +406,8 @@ class ModelBased(Algorithm):
 
         Args:
             present: back-offs, (2n,).
-            inputs: (s, a) of the present regime, (M, n+m).
+            inputs: (s, a, v) of the present regime, (M, n+m+n_v).
+            bounds: true ones of the states at these samples, (M, n) each.
         """
         settings = self.configuration
         problem = self._problem
@@ -387,8 +418,9 @@ class ModelBased(Algorithm):
             floor = np.minimum(self._floor, present)
         # What the plant has shown: its distances from the true bounds.
         states = inputs[:, : problem.n_states]
-        above = states - problem.state_lower
-        below = problem.state_upper - states
+        lower, upper = bounds
+        above = states - lower
+        below = upper - states
         distances = np.concatenate([above, below], axis=1)
         shown = settings.shrink_share * distances.min(axis=0)
         least: Array = np.clip(shown, floor, present)
@@ -444,6 +476,7 @@ class ModelBased(Algorithm):
             "floor": self._floor,
             "regime_start": self._regime_start,
             **prefixed("data", self._data.state_dict()),
+            **prefixed("signals", self._signals.state_dict()),
         }
 
     def load_state_dict(self, state: State) -> None:
@@ -456,6 +489,7 @@ class ModelBased(Algorithm):
         self._floor = state["floor"]
         self._regime_start = state["regime_start"]
         self._data.load_state_dict(part_of(state, "data"))
+        self._signals.load_state_dict(part_of(state, "signals"))
 
 
 class PredictedCost(NamedTuple):
@@ -465,11 +499,14 @@ class PredictedCost(NamedTuple):
         cost: mean per sample; infinite where the rollout is lost.
         derivative: of the mean stage cost by the model's coefficients, (q,).
         limits: of the mean cost of so many samples as each window of the change detection has.
+        price_cost: what prices alone add to the mean cost, at the reference, which is in neither
+            cost nor limits.
     """
 
     cost: float
     derivative: Array
     limits: Array
+    price_cost: float
 
 
 class ExpectedCosts:
@@ -489,12 +526,18 @@ class ExpectedCosts:
         fewness = (settings.tail_samples / len(errors)) ** 0.5
         self._widened = 1 + settings.tail_widening * fewness
 
-    def __call__(self, predicted: Array, h: Array) -> tuple[Array, Array]:
+    def __call__(
+        self,
+        predicted: Array,
+        h: Array,
+        bounds: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Array]:
         """Expected costs.
 
         Args:
             predicted: (s₊, ℓ), (M, K).
             h: sizes of the errors, (M, K).
+            bounds: of the states s₊ where they move, (M, n) each; None: the scenario's.
 
         Returns:
             Costs (M,), and the penalty of each bound in them, (2n, M).
@@ -502,7 +545,7 @@ class ExpectedCosts:
         states = predicted[:, :-1]
         stage_costs = predicted[:, -1]
         sizes = self._widened * h
-        due = expected_penalties(self.penalty, states, self._errors, sizes)
+        due = expected_penalties(self.penalty, states, self._errors, sizes, bounds)
         # From (state, bound) to lower bounds and then upper ones, as back-offs are.
         by_bound = due.swapaxes(0, 1)
         penalties = by_bound.reshape(-1, len(predicted))
@@ -526,6 +569,8 @@ class BackOffOnModel:
         visited: the latest inputs (s, a), (M, n+m), oldest first.
         settings: of the search.
         rng: draws the noise.
+        signals: of the scenario.
+        numbers: of the visited samples, (M,).
 
     Attributes:
         n_samples: of rollouts so far.
@@ -542,9 +587,12 @@ class BackOffOnModel:
         visited: Array,
         settings: ModelBasedConfiguration,
         rng: np.random.Generator,
+        signals: KnownSignals,
+        numbers: Sequence[int],
     ) -> None:
         n = problem.n_states
         self._settings = settings
+        self._signals = signals
         self._problem = problem
         self._rollout = rollout
         self._base = base
@@ -553,8 +601,15 @@ class BackOffOnModel:
         self._costs = ExpectedCosts(problem, model, settings)
         predicted, h, _ = model.predict(visited)
         # What no sample of the plant has cost, a rollout does not know.
-        visited_costs, _ = self._costs(predicted, h)
+        bounds = signals.bounds([number + 1 for number in numbers])
+        visited_costs, _ = self._costs(predicted, h, bounds)
+        n_loop = n + problem.n_actions
+        visited_costs = visited_costs - signals.price_costs(visited[:, n_loop:])
         self._largest_cost = visited_costs.max()
+        # What one set-point has cost is no measure of a period of several.
+        period = signals.period or settings.recent_samples
+        if signals.move_targets and len(visited) < min(period, settings.recent_samples):
+            self._largest_cost = np.inf
         states = visited[:, :n]
         self._start = states[-1]
         self._centre = states.mean(axis=0)
@@ -580,7 +635,10 @@ class BackOffOnModel:
 
     def draw(self, steps: int) -> None:
         """Draw new noise for rollouts of so many samples."""
+        settings = self._settings
         n_residuals = len(self._model.residuals)
+        steps = self._signals.whole_periods(steps, settings.burn_in, settings.memory)
+        self._met = self._signals.coming(steps)
         self._picks = self._rng.integers(n_residuals, size=steps, dtype=np.int32)
         self._known: dict[bytes, PredictedCost] = {}  # on this noise, by θ
 
@@ -603,6 +661,7 @@ class BackOffOnModel:
             self._start,
             self._model,
             self._picks,
+            self._met,
         )
         for key, samples in zip(new, rollouts, strict=True):
             self._known[key] = self._predicted_cost(samples)
@@ -619,8 +678,15 @@ class BackOffOnModel:
         complete = len(inputs) >= len(self._picks) - settings.burn_in
         if not complete or not np.isfinite(predicted).all():
             return self._lost
+        bounds = (
+            self._met.lower[settings.burn_in :],
+            self._met.upper[settings.burn_in :],
+        )
+        price_costs = self._met.costs[settings.burn_in :]
         with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
-            costs, penalties = self._costs(predicted, h)
+            costs, penalties = self._costs(predicted, h, bounds)
+        # Without what prices alone change: so hours are alike.
+        costs = costs - price_costs
         cost = float(costs.mean())
         if not np.isfinite(cost):
             return self._lost
@@ -636,7 +702,8 @@ class BackOffOnModel:
             return self._lost
         some_inputs = inputs[:: settings.cost_thinning]
         derivative = self._model.cost_derivative(some_inputs)
-        return PredictedCost(cost, derivative, self._limits_of(costs))
+        limits = self._limits_of(costs)
+        return PredictedCost(cost, derivative, limits, float(price_costs.mean()))
 
     def _limits_of(self, costs: Array) -> Array:
         """What the plant may cost before a prediction (M,) is called wrong, for each window."""
@@ -655,7 +722,7 @@ class BackOffOnModel:
         """What is predicted of a rollout that is lost."""
         derivative = np.zeros_like(self._model.mean)
         limits = np.full(len(self._settings.change_windows), np.inf)
-        return PredictedCost(np.inf, derivative, limits)
+        return PredictedCost(np.inf, derivative, limits, 0.0)
 
     def excess(self, one: PredictedCost, other: PredictedCost) -> float:
         """Cost of one above another's, in deviations of what the model knows of the difference."""

@@ -11,12 +11,16 @@ from math import ceil
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from cosim.core.protocols import Array
 from learning.algorithm import Transition
 from learning.checkpoint import State, part_of, prefixed
 from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
+
+NO_SIGNALS: Array = np.empty(0)
+"""What signals give of the model where there are none."""
 
 
 class Predictions(NamedTuple):
@@ -57,15 +61,21 @@ class PlantData:
         self.regime_start = 0
         self.changes = 0
         self.count_at_fit = 0
-        # A ring of transitions (s, a, s₊, ℓ).
+        # A ring of transitions (s, a, v, s₊, ℓ), and of their numbers in the run.
         width = features.n_inputs + features.n_outputs
         self._rows = np.zeros((settings.memory, width))
+        self._numbers = np.zeros(settings.memory, dtype=np.int64)
         self._earlier: EmpiricalModel | None = None  # from before the last change of the plant
         # Of the samples since the fit, a block for each `change_windows[0]` of them.
         self._blocks: list[Predictions] = []
 
-    def add(self, transition: Transition) -> None:
-        """Keep a transition in place of the oldest one."""
+    def add(self, transition: Transition, signals: Array = NO_SIGNALS) -> None:
+        """Keep a transition in place of the oldest one.
+
+        Args:
+            transition: the transition.
+            signals: what signals give of the model at its sample, v, (n_v,).
+        """
         # Without the penalty, which is known: what is learned is smooth.
         stage_cost = np.array([transition.stage_cost])
         oldest = self.count % len(self._rows)
@@ -73,21 +83,32 @@ class PlantData:
             [
                 transition.s,
                 transition.a,
+                signals,
                 transition.next_s,
                 stage_cost,
             ]
         )
+        self._numbers[oldest] = transition.number
         self.count += 1
 
     def latest(self, count: int) -> tuple[Array, Array]:
-        """Inputs (s, a) and outputs (s₊, ℓ) of so many of the latest samples, oldest first."""
+        """Inputs (s, a, v) and outputs (s₊, ℓ) of so many of the latest samples, oldest first."""
+        rows = self._rows[self._latest_places(count)]
+        n_inputs = self.features.n_inputs
+        return rows[:, :n_inputs], rows[:, n_inputs:]
+
+    def latest_numbers(self, count: int) -> list[int]:
+        """Numbers in the run of so many of the latest samples, oldest first."""
+        numbers: list[int] = self._numbers[self._latest_places(count)].tolist()
+        return numbers
+
+    def _latest_places(self, count: int) -> NDArray[np.intp]:
+        """Places in the ring of so many of the latest samples, oldest first."""
         size = len(self._rows)
         count = min(count, self.count, size)
         # The ring as time has it.
         samples = np.arange(self.count - count, self.count)
-        rows = self._rows[samples % size]
-        n_inputs = self.features.n_inputs
-        return rows[:, :n_inputs], rows[:, n_inputs:]
+        return samples % size
 
     @property
     def age(self) -> int:
@@ -241,6 +262,7 @@ class PlantData:
         """The transitions, the regime and the model."""
         state: State = {
             "rows": self._rows,
+            "numbers": self._numbers,
             "count": self.count,
             "regime_start": self.regime_start,
             "changes": self.changes,
@@ -255,6 +277,7 @@ class PlantData:
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned; predictions since the fit are made anew."""
         self._rows = state["rows"]
+        self._numbers = state["numbers"]
         self.count = state["count"]
         self.regime_start = state["regime_start"]
         self.changes = state["changes"]

@@ -200,6 +200,7 @@ def expected_penalties(
     predictions: Matrix,
     errors: SortedErrors,
     scales: Matrix | None = None,
+    bounds: tuple[Matrix, Matrix] | None = None,
 ) -> Matrix:
     """Expected penalty of each state's bounds, a mean over f + h e of all errors e.
 
@@ -208,20 +209,28 @@ def expected_penalties(
         predictions: f, (K, n).
         errors: e.
         scales: h, (K, n), one if not given.
+        bounds: lower and upper bounds of the states where they move, (K, n) each; the penalty's
+            if not given.
 
     Returns:
         Penalties of the lower and the upper bound, (n, 2, K).
     """
     if scales is None:
         scales = np.ones(predictions.shape)
+    if bounds is None:
+        bounds = (
+            np.broadcast_to(penalty.lower, predictions.shape),
+            np.broadcast_to(penalty.upper, predictions.shape),
+        )
     count, n = predictions.shape
     costs = np.zeros((n, 2, count))
     for i in range(n):
         predicted = predictions[:, i]
         h = scales[:, i]
-        bounds = (penalty.lower[i], penalty.upper[i])
-        for k, bound in enumerate(bounds):
-            if not np.isfinite(bound):
+        for k, moving in enumerate(bounds):
+            bound = moving[:, i]
+            # One that is infinite is no bound, and does not move.
+            if not np.isfinite(bound).all():
                 continue
             # In units of h the errors are the same for all predictions.
             threshold = (bound - predicted) / h

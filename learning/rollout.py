@@ -20,13 +20,14 @@ from controllers.theta import Parameters
 from cosim.core.loop import ClosedLoop
 from cosim.core.protocols import Array, Step
 from learning.empirical_model import EmpiricalModel, Features, c_definitions, pointers
+from learning.known_signals import SignalsOfSamples
 
 
 class RolloutSamples(NamedTuple):
     """The samples of a rollout, T of them.
 
     Attributes:
-        inputs: (s, a), (T, n+m).
+        inputs: (s, a, v), (T, n+m+n_v).
         predicted: (s₊, ℓ) without residual, with what persists of the error before, (T, K).
         h: sizes of the errors, (T, K).
     """
@@ -49,8 +50,6 @@ class Rollout:
         parameters: Parameters,
         features: Features,
     ) -> None:
-        # A rollout's controller is told nothing at its samples.
-        assert not problem.varying, "a rollout knows no signals"
         self._problem = problem
         self._features = features
         self._controller = RtiNmpc(problem, parameters)
@@ -60,8 +59,12 @@ class Rollout:
             return
         # The nominal model as C beside the controller's: both in one library.
         sizes = {"K": features.n_outputs, **work_sizes("NOMINAL", function)}
+        # At each sample the controller is told the values of all stages.
+        known_counts = [problem.horizon + 1] * len(problem.varying)
+        if features.n_signals:
+            sizes["N_SIGNALS"] = features.n_signals
         sources: dict[str, str | bytes] = {
-            **core(problem, parameters).sources,
+            **core(problem, parameters, known_counts=known_counts).sources,
             "sizes.h": c_definitions(sizes),
             # Where a function says that it is exported, Windows exports no other.
             "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
@@ -81,6 +84,7 @@ class Rollout:
         start: Array,
         model: EmpiricalModel,
         picks: NDArray[np.int32],
+        signals: SignalsOfSamples | None = None,
     ) -> list[RolloutSamples]:
         """Run each θ. The compiled rollouts of several run at once, in threads.
 
@@ -91,15 +95,22 @@ class Rollout:
             start: state, (n,).
             model: plays the plant.
             picks: which of the model's residuals each sample meets, (T,).
+            signals: what each sample meets of the problem's signals; None without any.
 
         Returns:
             The samples of each θ, fewer than T where a state is not finite.
         """
+        n_stages = self._problem.horizon + 1
+        stages = np.empty((len(picks), n_stages, 0))
+        inputs = np.empty((len(picks), 0))
+        if signals is not None:
+            stages = signals.stages
+            inputs = signals.inputs
 
         def one(theta: Array) -> RolloutSamples:
             if self.compiled is None:
-                return self._interpreted(theta, start, model, picks)
-            return self._compiled(theta, start, model, picks)
+                return self._interpreted(theta, start, model, picks, stages, inputs)
+            return self._compiled(theta, start, model, picks, stages, inputs)
 
         # CasADi's functions are not for several threads; compiled ones are.
         n_threads = 1 if self.compiled is None else None
@@ -112,24 +123,28 @@ class Rollout:
         start: Array,
         model: EmpiricalModel,
         picks: NDArray[np.int32],
+        stages: Array,
+        signals: Array,
     ) -> RolloutSamples:
         """One rollout in C (`rollout.c`)."""
         features = self._features
         n_samples = len(picks)
         c, W = model.coefficients
         # C reads rows, one after the other.
-        arrays = [theta, start, c, W, model.persistence, model.residuals, picks]
+        arrays = [theta, start, c, W, model.persistence, model.residuals, picks, stages, signals]
         in_rows = [np.ascontiguousarray(array) for array in arrays]
         arguments = pointers(*in_rows)
         table = np.empty((n_samples, self._n_columns))
         assert self.compiled is not None
         done = self.compiled(*arguments, n_samples, *pointers(table))
         # A row is the one of every closed loop: state and action, the plant's outputs, and more.
-        sizes = [features.n_inputs, features.n_outputs, features.n_outputs]
+        n_loop = features.n_inputs - features.n_signals
+        sizes = [n_loop, features.n_outputs, features.n_outputs]
         ends = np.cumsum(sizes)
-        inputs, predicted, h, _ = np.split(table[:done], ends, axis=1)
+        states_and_actions, predicted, h, _ = np.split(table[:done], ends, axis=1)
+        inputs = np.concatenate([states_and_actions, signals[:done]], axis=1)
         # Copies: the table, whose other columns nobody reads, need not stay.
-        return RolloutSamples(inputs.copy(), predicted.copy(), h.copy())
+        return RolloutSamples(inputs, predicted.copy(), h.copy())
 
     def _interpreted(
         self,
@@ -137,11 +152,18 @@ class Rollout:
         start: Array,
         model: EmpiricalModel,
         picks: NDArray[np.int32],
+        stages: Array,
+        signals: Array,
     ) -> RolloutSamples:
         """The same in Python."""
-        plant = ModelledPlant(model, start, picks)
+        plant = ModelledPlant(model, start, picks, signals)
         self._controller.theta = theta
-        loop = ClosedLoop(plant.step, self._controller, self._problem)
+        varying = self._problem.varying
+
+        def known(k: int) -> dict[str, Array]:
+            return {item.signal: stages[k, :, row] for row, item in enumerate(varying)}
+
+        loop = ClosedLoop(plant.step, self._controller, self._problem, known=known)
         loop.start(start)
         n_samples = 0
         with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
@@ -164,6 +186,7 @@ class ModelledPlant:
         model: plays the plant.
         start: state, (n,).
         picks: which of the model's residuals each sample meets, (T,).
+        signals: what signals give of the model at each sample, v, (T, n_v).
 
     Attributes:
         inputs, predicted, h: rows of `RolloutSamples`, (T, …), filled so far as it has stepped.
@@ -174,12 +197,14 @@ class ModelledPlant:
         model: EmpiricalModel,
         start: Array,
         picks: NDArray[np.int32],
+        signals: Array,
     ) -> None:
         features = model.features
         n_samples = len(picks)
         self._model = model
         self._c, self._W = model.coefficients
         self._picks = picks
+        self._signals = signals
         self._s = start
         self._error = np.zeros(features.n_outputs)  # r of the sample before
         self._number = 0
@@ -192,8 +217,9 @@ class ModelledPlant:
         model = self._model
         number = self._number
         # As in C: the prediction first, the residual makes the next state.
-        inputs = np.concatenate([self._s, a])
-        y, h_column = model.features.mean(self._s, a, self._c)
+        action_and_signals = np.concatenate([a, self._signals[number]])
+        inputs = np.concatenate([self._s, action_and_signals])
+        y, h_column = model.features.mean(self._s, action_and_signals, self._c)
         h = h_column.full()[:, 0]
         nominal = y.full()[:, 0]
         linear_part = self._W @ np.append(1.0, inputs)

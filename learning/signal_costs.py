@@ -7,10 +7,12 @@ predicted ones: a learning rule would take this for an error of V. At the refere
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
 from controllers.functions import StackedFunction, define
 from controllers.problem import Problem
 from controllers.varying import of_kind
+from cosim.core.protocols import Array
 from cosim.core.signals import Known
 
 
@@ -54,8 +56,19 @@ class SignalCosts:
         value = sum(d * change for d, change in zip(self._discounts, stages, strict=True))
         return stages[0], value
 
+    def along(self, prices: Array) -> Array:
+        """The change of the stage cost of K samples, (K,).
+
+        Args:
+            prices: at these samples, in the order of the problem's, (K, n_prices).
+        """
+        changes = [self._change_at(tuple(row)) for row in prices.tolist()]
+        return np.array(changes, dtype=np.float64)
+
     def _change_at(self, prices: tuple[float, ...]) -> float:
         """The change of a stage's cost at some prices."""
+        if not prices:
+            return 0.0
         if prices not in self._changes:
             self._change.inputs["prices"][:] = prices
             self._change()

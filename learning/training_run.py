@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from math import gcd, isclose, isfinite, lcm
+from math import gcd, isfinite
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,10 @@ from controllers.estimator import ExtendedKalmanFilter
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
+from controllers.varying import given_parameters
 from cosim.core.protocols import Vector
 from cosim.core.scenario import EstimatorTable, Scenario
+from cosim.core.signals import period_of
 from cosim.core.simulation import spawn_seeds
 from cosim.core.training_options import (
     DEFAULT_SAMPLES,
@@ -222,7 +224,7 @@ def _with_held_out_runs(
     if options.evaluation_steps is not None:
         return options
     # A part of a day says nothing of what the day costs.
-    longest = _in_whole_periods(EVALUATION_STEPS, _period(scenario) or 1)
+    longest = _in_whole_periods(EVALUATION_STEPS, period_of(scenario) or 1)
     if scenario.plant.fmu in SHIPPED_FMUS or not options.evaluation_seeds:
         return replace(options, evaluation_steps=longest)
     assert options.evaluate_every is not None
@@ -399,26 +401,13 @@ def _shift_samples(hours: float, scenario: Scenario) -> int | None:
         scenario: has the sampling time, and perhaps signals.
     """
     shift = round(3600.0 * hours / scenario.sampling_time)
-    period = _period(scenario)
+    period = period_of(scenario)
     return None if period is None else _in_whole_periods(shift, period)
 
 
 def _in_whole_periods(samples: int, period: int) -> int:
     """The least multiple of a period from so many samples on."""
     return -(-samples // period) * period
-
-
-def _period(scenario: Scenario) -> int | None:
-    """Samples after which all signals begin again, 1 without any; None where there is none."""
-    period = 1
-    for signal in scenario.valued_signals:
-        if signal.period is None:
-            return None
-        samples = round(signal.period / scenario.sampling_time)
-        if not isclose(samples * scenario.sampling_time, signal.period, rel_tol=1e-9):
-            return None
-        period = lcm(period, samples)
-    return period
 
 
 def starting_parameters(
@@ -461,8 +450,10 @@ def starting_parameters(
         noise = file.blocks.block("noise").labels
     if file is not None and "p" in file.blocks:
         labels += file.blocks.block("p").labels
+    # What a signal gives of the model is known, and nothing to learn.
+    given = given_parameters(problem.varying, problem.model)
     for name in configuration.learned_parameters(problem.model):
-        if name not in labels:
+        if name not in labels and name not in given:
             labels.append(name)
     blocks = ThetaBlocks.from_problem(
         problem,

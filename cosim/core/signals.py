@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Mapping
-from math import floor
+from math import floor, isclose, lcm
 
 import numpy as np
 from numpy.typing import NDArray
@@ -347,6 +347,19 @@ def _times(table: SignalTable) -> list[float]:
 def signals_of(scenario: Scenario) -> Signals | None:
     """The signals of a scenario; None without any."""
     return Signals(scenario) if scenario.signals else None
+
+
+def period_of(scenario: Scenario) -> int | None:
+    """Samples after which all valued signals begin again, 1 without any; None where none is."""
+    period = 1
+    for table in scenario.valued_signals:
+        if table.period is None:
+            return None
+        samples = round(table.period / scenario.sampling_time)
+        if not isclose(samples * scenario.sampling_time, table.period, rel_tol=1e-9):
+            return None
+        period = lcm(period, samples)
+    return period
 
 
 def sample_numbers(times: Array, scenario: Scenario) -> NDArray[np.intp]:

@@ -1,147 +1,279 @@
-"""Whether what a log predicts is true: `python -m benchmarks.logged_data`.
+"""Whether what a log predicts is true: `python -m benchmarks.logged_data --out FOLDER`.
 
-Logs of two days each, of `pi`, `lqr` and `cautious` on `paper` and `fouled`. The rule learns from
-each of them alone; then the plant itself says what θ costs, on noise that no log met. A row is a
-log: the predicted differences of J with their 95 % intervals, and the true ones.
+A log is a week of one plant under one regime. A rule learns from it alone; then the plant itself
+says what θ costs, on noise that no log met. Each log is a row of FOLDER/logs.csv, appended once it
+is judged: the command goes on where it was ended. FOLDER/table.md sums the rows up.
+
+The regimes are `pi`, `lqr`, `cautious`, and `steps`: `cautious` with an operator's steps on top.
 """
 
 import argparse
+import csv
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measuring import clock
-from controllers import compile_functions
+from controllers import RtiNmpc, compile_functions
+from controllers.errors import OptimumError
 from controllers.factories import nmpc
 from cosim import FmuPlant, Scenario, build_controller, simulate
-from cosim.cli.output import output
-from cosim.core.files import temporary_folder
+from cosim.core.files import temporary_folder, write_atomically
+from cosim.core.protocols import Decision
 from cosim.core.simulation import indicators_of
 from cosim.core.statistics import mean
 from learning import train_from_data
 
-SCENARIOS = ("paper", "fouled")
-LOGGED = ("pi", "lqr", "cautious")
-LOGS = 2
-"""Logs of each controller on each scenario."""
-LENGTH = 2880
-"""Samples of a log: two days of minutes."""
-HELD_OUT = 500_000
+RANDOM_PLANTS = [f"random-{seed}" for seed in range(16)]
+COLOURED_PLANTS = [f"random-coloured-{seed}" for seed in range(16)]
+PLANTS = (RANDOM_PLANTS + COLOURED_PLANTS)[1:30:3]
+"""Every third of the 32 random plants: ten of them."""
+REGIMES = ("pi", "lqr", "cautious", "steps")
+EXCITED = ("cautious", "steps")
+"""Regimes in which something moves the inputs about the states that matter."""
+FIRST_SEED, LOGS = 7_200_000, 5
+"""Noise of the logs, and their number for each plant and regime."""
+WEEK = 7 * 86400.0
+"""Length of a log in s."""
+STEP_SHARE, STEP_SECONDS = 0.05, 1200.0
+"""An operator's step: up to this share of the range of each input, held for this long."""
+HELD_OUT = 7_300_000
 """First seed of the noise on which the plant says what is true."""
-SEEDS, STEPS = 40, 2500
-HEADER = (
-    "scenario",
-    "logged",
+SEEDS, SAMPLES = 40, 2500
+START = "cautious"
+COLUMNS = (
+    "plant",
+    "regime",
     "seed",
+    "transitions",
     "verdict",
-    "θ less start",
-    "true",
-    "held",
-    "θ less log",
-    "true",
-    "held",
+    "status",
+    "J_logged",
+    # Predicted differences of J with the ends of their intervals, then what the plant says.
+    "less_start",
+    "less_start_low",
+    "less_start_high",
+    "true_less_start",
+    "true_less_start_low",
+    "true_less_start_high",
+    "less_log",
+    "less_log_low",
+    "less_log_high",
+    "true_less_log",
+    "true_less_log_low",
+    "true_less_log_high",
+    # What follows the verdict: the learned θ or the start's.
+    "J",
+    "J_optimal",
 )
 
 
-def true_costs(plant, controller):
-    """J of a controller on the held-out seeds, (SEEDS,)."""
-    compile_functions(controller, SEEDS * STEPS)
-    seeds = range(HELD_OUT, HELD_OUT + SEEDS)
-    return indicators_of(plant, controller, seeds, STEPS)["J"]
+class OperatorSteps:
+    """A controller with an operator's steps on top of its actions.
+
+    Args:
+        controller: acts before the steps are added.
+        scenario: has ranges and sampling time.
+        seed: of the steps.
+    """
+
+    name = "steps"
+
+    def __init__(self, controller, scenario, seed):
+        self._controller = controller
+        self._lower = scenario.action_lower
+        self._upper = scenario.action_upper
+        self._held = round(STEP_SECONDS / scenario.sampling_time)
+        self._seed = seed
+        self.reset()
+
+    def reset(self):
+        """Begin the same steps anew."""
+        self._controller.reset()
+        self._rng = np.random.default_rng(self._seed)
+        self._number = 0
+        self._step = np.zeros_like(self._lower)
+
+    def prepare(self):
+        """As the controller does."""
+        self._controller.prepare()
+
+    def feedback(self, s, a=None):
+        """The controller's action and the present step, within the actuators' bounds."""
+        assert a is None
+        if self._number % self._held == 0:
+            reach = STEP_SHARE * (self._upper - self._lower)
+            self._step = self._rng.uniform(-reach, reach)
+        self._number += 1
+        action = self._controller.feedback(s).action + self._step
+        return Decision(np.clip(action, self._lower, self._upper))
 
 
-def holds(predicted, true):
-    """Whether a predicted interval holds the true difference, within the error of the latter."""
-    if predicted.interval is None:
-        return False
-    low, high = predicted.interval
-    true_low, true_high = true.interval
-    return low <= true_high and true_low <= high
+@dataclass
+class Judge:
+    """The plant that says what is true, with what it has said of controllers that recur."""
+
+    scenario: Scenario
+    plant: FmuPlant
+    algorithm: str
+
+    def __post_init__(self):
+        self._start = build_controller(START, self.scenario)
+        self.start_costs = self.costs(self._start)
+        self._regime_costs = {START: self.start_costs}
+        try:
+            self.optimal = self.costs(build_controller("optimal", self.scenario)).mean()
+        except OptimumError:
+            # No grid holds the values of several disturbances with a memory.
+            self.optimal = np.nan
+
+    def costs(self, controller):
+        """J of a controller on the held-out seeds, (SEEDS,)."""
+        if isinstance(controller, RtiNmpc):
+            compile_functions(controller, SEEDS * SAMPLES)
+        seeds = range(HELD_OUT, HELD_OUT + SEEDS)
+        return indicators_of(self.plant, controller, seeds, SAMPLES)["J"]
+
+    def in_charge(self, regime, seed):
+        """What is in charge in a regime."""
+        if regime == START:
+            return self._start
+        if regime == "steps":
+            return OperatorSteps(self._start, self.scenario, seed)
+        return build_controller(regime, self.scenario)
+
+    def row(self, regime, seed, folder):
+        """Log a week, learn from it and ask the plant; the row of `COLUMNS`."""
+        controller = self.in_charge(regime, seed)
+        if regime not in self._regime_costs:
+            self._regime_costs[regime] = self.costs(controller)
+        file = folder / "log.csv"
+        samples = round(WEEK / self.scenario.sampling_time)
+        simulate(self.plant, controller, samples, seed).write_csv(file)
+        start = self._start.parameters.save(folder / "start.toml")
+        answer = train_from_data(self.algorithm, file, self.scenario, start=start, seed=seed)
+        costs = self.start_costs
+        # θ that is the start's costs what that does.
+        if not np.array_equal(answer.learned.theta, answer.start.theta):
+            costs = self.costs(nmpc(self.scenario, answer.learned))
+        followed = costs if answer.verdict == "better" else self.start_costs
+        row = [
+            self.scenario.name,
+            regime,
+            seed,
+            len(answer.data),
+            answer.verdict,
+            answer.status,
+            answer.logged_cost,
+        ]
+        truths = (mean(costs - self.start_costs), mean(costs - self._regime_costs[regime]))
+        predictions = (answer.against_start, answer.against_logged)
+        for estimate, truth in zip(predictions, truths, strict=True):
+            row += [estimate.value, *(estimate.interval or (-np.inf, np.inf))]
+            row += [truth.value, *truth.interval]
+        return [*row, followed.mean(), self.optimal]
 
 
-def calibrate(algorithm, start, logs, scenarios=SCENARIOS, controllers=LOGGED):
-    """Rows of all logs, each a dictionary."""
-    rows = []
-    for name in scenarios:
+def calibrate(algorithm, plants, regimes, seeds, path):
+    """Append the rows that a file of logs lacks."""
+    done = set()
+    if path.exists():
+        for row in rows_of(path):
+            done.add((row["plant"], row["regime"], int(row["seed"])))
+    else:
+        write_atomically(path, ",".join(COLUMNS) + "\n")
+    for name in plants:
+        missing = []
+        for seed in seeds:
+            for regime in regimes:
+                if (name, regime, seed) not in done:
+                    missing.append((regime, seed))
+        if not missing:
+            continue
         scenario = Scenario.load(name)
         with FmuPlant(scenario) as plant, temporary_folder("cosim-logs-") as folder:
-            start_costs = true_costs(plant, build_controller(start, scenario))
-            for logged in controllers:
-                controller = build_controller(logged, scenario)
-                logged_costs = true_costs(plant, controller)
-                for seed in range(logs):
-                    file = Path(folder) / f"{logged}-{seed}.csv"
-                    simulate(plant, controller, LENGTH, seed).write_csv(file)
-                    answer = train_from_data(algorithm, file, scenario, start=start, seed=seed)
-                    costs = start_costs
-                    # θ that is the start's costs what that does.
-                    if not np.array_equal(answer.learned.theta, answer.start.theta):
-                        costs = true_costs(plant, nmpc(scenario, answer.learned))
-                    against_start = mean(costs - start_costs)
-                    against_logged = mean(costs - logged_costs)
-                    rows.append(
-                        {
-                            "scenario": name,
-                            "logged": logged,
-                            "seed": seed,
-                            "verdict": answer.verdict,
-                            "against_start": answer.against_start,
-                            "true_against_start": against_start,
-                            "start_held": holds(answer.against_start, against_start),
-                            "against_logged": answer.against_logged,
-                            "true_against_logged": against_logged,
-                            "logged_held": holds(answer.against_logged, against_logged),
-                        }
-                    )
+            judge = Judge(scenario, plant, algorithm)
+            for regime, seed in missing:
+                row = judge.row(regime, seed, Path(folder))
+                cells = [f"{x:.8g}" if isinstance(x, float) else str(x) for x in row]
+                with path.open("a", encoding="utf-8") as file:
+                    file.write(",".join(cells) + "\n")
+
+
+def rows_of(path):
+    """The rows of a file of logs: numbers where a column has them."""
+    words = ("plant", "regime", "verdict", "status")
+    rows = []
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            rows.append({k: v if k in words else float(v) for k, v in row.items()})
     return rows
 
 
-def _text(estimate):
-    """An estimate with its interval, in whole units."""
-    if estimate.interval is None:
-        return f"{estimate.value:.0f}"
-    low, high = estimate.interval
-    return f"{estimate.value:.0f} [{low:.0f}, {high:.0f}]"
+def holds(row, name):
+    """Whether the true difference lies in a predicted interval."""
+    return row[f"{name}_low"] <= row[f"true_{name}"] <= row[f"{name}_high"]
+
+
+def nearly_holds(row, name):
+    """Whether it does within its own error, since the plant's noise is finite, too."""
+    below = row[f"true_{name}_high"] < row[f"{name}_low"]
+    above = row[f"true_{name}_low"] > row[f"{name}_high"]
+    return not (below or above)
+
+
+def table(rows):
+    """Markdown: a line for each regime, and one for all."""
+    lines = [
+        "| logged by | logs | intervals that hold | within the truth's error | `better` | "
+        "costs more than what was logged | regret %, median | largest |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for regime in (*REGIMES, "all"):
+        chosen = [row for row in rows if regime in (row["regime"], "all")]
+        if not chosen:
+            continue
+        both = [(row, name) for row in chosen for name in ("less_start", "less_log")]
+        share = 100 * np.mean([holds(*pair) for pair in both])
+        near = 100 * np.mean([nearly_holds(*pair) for pair in both])
+        better = sum(row["verdict"] == "better" for row in chosen)
+        # The same noise judges both: of the start, J is that of the learned θ less their difference.
+        worse = 0
+        regrets = []
+        for row in chosen:
+            learned = row["verdict"] == "better"
+            against_log = row["true_less_log"]
+            if not learned:
+                against_log -= row["true_less_start"]
+            worse += against_log > 0
+            if np.isfinite(row["J_optimal"]):
+                regrets.append(100 * (row["J"] / row["J_optimal"] - 1))
+        regret = f"{np.median(regrets):.2f} | {max(regrets):.2f}" if regrets else " | "
+        lines.append(
+            f"| `{regime}` | {len(chosen)} | {share:.1f} % | {near:.1f} % | {better} | "
+            f"{100 * worse / len(chosen):.1f} % | {regret} |"
+        )
+    return "\n".join(lines) + "\n"
 
 
 def main():
     parser = argparse.ArgumentParser("python -m benchmarks.logged_data", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of logs.csv and table.md")
     parser.add_argument("--algorithm", "-a", default="model-based")
-    parser.add_argument("--start", default="cautious")
-    parser.add_argument("--scenarios", default=",".join(SCENARIOS))
-    parser.add_argument("--controllers", default=",".join(LOGGED))
-    parser.add_argument("--logs", type=int, default=LOGS, help="logs of each controller")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--plants", default=",".join(PLANTS))
+    parser.add_argument("--regimes", default=",".join(REGIMES))
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument("--logs", type=int, default=LOGS, help="of each plant and regime")
     chosen = parser.parse_args()
-    begin = clock()
-    scenarios = chosen.scenarios.split(",")
-    controllers = chosen.controllers.split(",")
-    rows = calibrate(chosen.algorithm, chosen.start, chosen.logs, scenarios, controllers)
-    seconds = clock() - begin
-    with output(chosen.json) as out_:
-        lines = []
-        for row in rows:
-            lines.append(
-                (
-                    row["scenario"],
-                    row["logged"],
-                    str(row["seed"]),
-                    row["verdict"],
-                    _text(row["against_start"]),
-                    _text(row["true_against_start"]),
-                    "yes" if row["start_held"] else "no",
-                    _text(row["against_logged"]),
-                    _text(row["true_against_logged"]),
-                    "yes" if row["logged_held"] else "no",
-                )
-            )
-        held = sum(row["start_held"] + row["logged_held"] for row in rows)
-        title = (
-            f"{chosen.algorithm} from logs: {held} of {2 * len(rows)} intervals hold, "
-            f"{seconds:.0f} s of processor time"
-        )
-        out_.table(title, HEADER, lines)
-        out_.json({"held": held, "intervals": 2 * len(rows), "rows": rows})
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    path = chosen.out / "logs.csv"
+    seeds = range(chosen.first_seed, chosen.first_seed + chosen.logs)
+    plants = chosen.plants.split(",")
+    regimes = chosen.regimes.split(",")
+    calibrate(chosen.algorithm, plants, regimes, seeds, path)
+    text = table(rows_of(path))
+    write_atomically(chosen.out / "table.md", text)
+    print(text, end="")
 
 
 if __name__ == "__main__":

@@ -575,7 +575,7 @@ class EmpiricalModel:
         count: int,
         rng: np.random.Generator,
         follows: NDArray[np.bool_] | None = None,
-        rounds: int = 3,
+        rounds: int = 2,
     ) -> list[EmpiricalModel]:
         """Models from the posterior: each is a fit to outputs and a prior that are moved by chance.
 
@@ -605,18 +605,36 @@ class EmpiricalModel:
         design, target = regression.equations(self.mean[:p], 1, self.persistence)
         _, _, prior = _posterior(design, target, noise, widths)
         largest = settings.largest_parameter_error
-        models = []
+
+        moves = []
+        centres = []
         for _ in range(count):
-            moved = rng.multivariate_normal(np.zeros(len(noise)), noise, len(target))
-            centre = prior * rng.standard_normal(prior.size)
-            mean = self.mean
-            for _ in range(rounds):
+            moves.append(rng.multivariate_normal(np.zeros(len(noise)), noise, len(target)))
+            centres.append(prior * rng.standard_normal(prior.size))
+
+        def moved(number: int) -> Array:
+            """The target of a model: about its moved centre the prior is the usual one."""
+            return target + moves[number] - design @ centres[number]
+
+        def at(number: int, distance: Array) -> Array:
+            """Coefficients of a model at a distance from its moved centre, (q,)."""
+            mean: Array = centres[number] + distance
+            mean[:p] = mean[:p].clip(-largest, largest)
+            return mean
+
+        # All models begin at one point, so that the first step has one factorisation.
+        targets = [moved(number) for number in range(count)]
+        R_design, R_targets = _whitened_triangle(design, targets, noise)
+        means = []
+        for number in range(count):
+            distance, _, _ = _of_triangle(R_design, R_targets[:, number], [prior])
+            means.append(at(number, distance))
+        models = []
+        for number, mean in enumerate(means):
+            for _ in range(rounds - 1):
                 design, target = regression.equations(mean[:p], 1, self.persistence)
-                # About its moved centre the prior is the usual one.
-                about_centre = target + moved - design @ centre
-                distance, _, _ = _posterior(design, about_centre, noise, [prior])
-                mean = centre + distance
-                mean[:p] = mean[:p].clip(-largest, largest)
+                distance, _, _ = _posterior(design, moved(number), noise, [prior])
+                mean = at(number, distance)
             models.append(replace(self, mean=mean))
         return models
 
@@ -813,22 +831,42 @@ def _posterior(
         noise: covariance of the residuals, (K, K).
         priors: deviations (q,) to choose from.
     """
+    R_design, R_targets = _whitened_triangle(design, [target], noise)
+    return _of_triangle(R_design, R_targets[:, 0], priors)
+
+
+def _whitened_triangle(
+    design: Array,
+    targets: Sequence[Array],
+    noise: Array,
+) -> tuple[Array, Array]:
+    """R of the whitened equations, (·, q), and the targets in its rows, (·, D).
+
+    Args:
+        design: (M, K, q).
+        targets: D of them, (M, K) each.
+        noise: covariance of the residuals, (K, K).
+    """
     # Whitened outputs have independent errors of one size.
-    cholesky = np.linalg.cholesky(noise)
-    whiten = np.linalg.inv(cholesky)
-    white_design = whiten @ design
-    white_target = target @ whiten.T
-    # An equation for each output of each sample; the target is their last column.
+    whiten = np.linalg.inv(np.linalg.cholesky(noise))
+    # An equation for each output of each sample; the targets are their last columns.
     n_coefficients = design.shape[2]
-    equations = np.column_stack(
-        [
-            white_design.reshape(-1, n_coefficients),
-            white_target.reshape(-1),
-        ]
-    )
-    R = _triangle(equations)
-    R_design = R[:, :-1]
-    R_target = R[:, -1]
+    white_design = whiten @ design
+    columns = [white_design.reshape(-1, n_coefficients)]
+    for target in targets:
+        white_target = target @ whiten.T
+        columns.append(white_target.reshape(-1))
+    R = _triangle(np.column_stack(columns))
+    # Rows below the coefficients' and the targets' own diagonal are zero.
+    return R[:, :n_coefficients], R[:, n_coefficients:]
+
+
+def _of_triangle(
+    R_design: Array,
+    R_target: Array,
+    priors: Sequence[Array],
+) -> tuple[Array, Array, Array]:
+    """`_posterior` of equations in triangular form, (·, q) and (·,)."""
     greatest = -np.inf
     best: tuple[Array, Array, Array] | None = None
     for prior in priors:
@@ -837,7 +875,7 @@ def _posterior(
         prior_rows = np.eye(prior.size)
         all_rows = np.concatenate([data_rows, prior_rows])
         Q, root = np.linalg.qr(all_rows)
-        Q_data = Q[: len(R)]
+        Q_data = Q[: len(R_design)]
         moment = Q_data.T @ R_target
         factor = prior[:, None] * np.linalg.inv(root)
         # Evidence: how well the data are explained, less what the fit could have explained.

@@ -56,7 +56,7 @@ class LogConfiguration(BaseModel):
     longest_dropout: Count = Field(10, description="most rows from a jump to the one back")
     # how a prediction is judged
     drawn_models: Annotated[int, Field(ge=2)] = Field(
-        24,
+        16,
         description="models that are drawn from the posterior",
     )
     stretches: Annotated[tuple[Stretches, ...], Field(min_length=1)] = Field(

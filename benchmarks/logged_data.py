@@ -237,7 +237,7 @@ def table(rows):
         share = 100 * np.mean([holds(*pair) for pair in both])
         near = 100 * np.mean([nearly_holds(*pair) for pair in both])
         better = sum(row["verdict"] == "better" for row in chosen)
-        # The same noise judges both: of the start, J is that of the learned θ less their difference.
+        # The same noise judges both: the start costs what the learned θ does, less its difference.
         worse = 0
         regrets = []
         for row in chosen:

@@ -630,12 +630,13 @@ class EmpiricalModel:
             distance, _, _ = _of_triangle(R_design, R_targets[:, number], [prior])
             means.append(at(number, distance))
         models = []
-        for number, mean in enumerate(means):
+        for number in range(count):
             for _ in range(rounds - 1):
-                design, target = regression.equations(mean[:p], 1, self.persistence)
+                c = means[number][:p]
+                design, target = regression.equations(c, 1, self.persistence)
                 distance, _, _ = _posterior(design, moved(number), noise, [prior])
-                mean = at(number, distance)
-            models.append(replace(self, mean=mean))
+                means[number] = at(number, distance)
+            models.append(replace(self, mean=means[number]))
         return models
 
     def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
@@ -852,7 +853,7 @@ def _whitened_triangle(
     # An equation for each output of each sample; the targets are their last columns.
     n_coefficients = design.shape[2]
     white_design = whiten @ design
-    columns = [white_design.reshape(-1, n_coefficients)]
+    columns: list[Array] = [white_design.reshape(-1, n_coefficients)]
     for target in targets:
         white_target = target @ whiten.T
         columns.append(white_target.reshape(-1))

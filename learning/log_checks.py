@@ -43,7 +43,7 @@ def usable(
         LoggedDataError: the log is doubtful, or too little of it is left.
     """
     data = data.latest(settings.memory)
-    _check_order(data, scenario, features, log_settings)
+    _check_order(data, scenario, features, settings, log_settings)
     _check_units(data, scenario, features, log_settings)
     data = data.without(_there_and_back(data, features, log_settings), "jump there and back")
     inputs, outputs = inputs_and_outputs(data, features)
@@ -105,21 +105,28 @@ class _Errors(NamedTuple):
     Attributes:
         errors: (M, n).
         rounding: their least deviations, (M, n).
+        sizes: h, (M, n).
     """
 
     errors: Array
     rounding: Array
+    sizes: Array
 
     def centred(self) -> _Errors:
         """The same with errors of mean zero."""
-        return _Errors(self.errors - self.errors.mean(axis=0), self.rounding)
+        return self._replace(errors=self.errors - self.errors.mean(axis=0))
+
+    @property
+    def covariance(self) -> Array:
+        """Of errors about zero, (n, n), each variance at least that of rounding."""
+        least_variance = (self.rounding**2).mean(axis=0)
+        covariance: Array = self.errors.T @ self.errors / len(self.errors)
+        return covariance + np.diag(least_variance)
 
     def log_likelihood(self) -> float:
         """Of normal errors of mean zero and unknown covariance, but for a constant."""
         count = len(self.errors)
-        covariance = self.errors.T @ self.errors / count
-        least_variance = (self.rounding**2).mean(axis=0)
-        _, logarithm = np.linalg.slogdet(covariance + np.diag(least_variance))
+        _, logarithm = np.linalg.slogdet(self.covariance)
         return float(-count * logarithm / 2)
 
 
@@ -136,19 +143,22 @@ def _nominal_errors(
     predicted = y[:, :n]
     errors = (next_states - predicted) / sizes
     rounding = INTEGRATION_ERROR * np.abs(predicted) / sizes
-    return _Errors(errors, rounding)
+    return _Errors(errors, rounding, sizes)
 
 
 def _check_order(
     data: LoggedData,
     scenario: Scenario,
     features: Features,
+    model_settings: EmpiricalModelConfiguration,
     settings: LogConfiguration,
 ) -> None:
     """Refuse a log whose inputs are a row off, or whose columns are exchanged.
 
-    Only the nominal model is asked, and only whether it explains the states better when the log is
-    read otherwise. A fitted model would find the controller's own law in inputs of the next row.
+    What is asked is whether the model explains the states better when the log is read otherwise. Of
+    shifts it is the nominal model, since a fitted one would find the controller's own law in inputs
+    of the next row. Of exchanged columns it is the model with its parameters fitted to each
+    reading, too: two inputs of nearly one size may undo an error of a parameter.
     """
     rows = _unbroken_rows(data, settings.largest_shift)
     if len(rows) < 10 * features.n_outputs:
@@ -157,7 +167,6 @@ def _check_order(
     actions = data.actions[rows]
     next_states = data.next_states[rows]
     as_it_is = _nominal_errors(features, states, actions, next_states)
-    likelihood = as_it_is.log_likelihood()
 
     # A shift leaves the mean error as it is, which is the plant's own.
     gains = {}
@@ -167,18 +176,41 @@ def _check_order(
         reading = _nominal_errors(features, states, shifted, next_states).centred()
         gains[_in_words(shift)] = reading.log_likelihood() - centred_likelihood
     # Exchanged columns have another mean, and may make the model's states stand still: it counts.
+    thinning = max(len(rows) // model_settings.fit_samples, 1)
+    as_logged = _Reading(states[::thinning], actions[::thinning], next_states[::thinning])
+
+    # Fitted parameters may explain a wrong unit: of that the nominal model says more.
+    changes = (next_states - states) / as_it_is.sizes
+    spreads = np.sqrt(np.mean(changes**2, axis=0)).tolist()
+    numbers_of_rounds = [1, model_settings.fit_rounds]
+    for errors, spread in zip(as_it_is.errors.T, spreads, strict=True):
+        if _is_unlike(errors, spread, settings):
+            numbers_of_rounds = [1]
+
+    def gain_of(reading: _Reading) -> float:
+        """By how many nats the model explains this reading better than the log as it is.
+
+        The fitted model must explain it better by more than the nominal one explains it worse.
+        """
+        gain = 0.0
+        for rounds in numbers_of_rounds:
+            as_read = _fitted(features, reading, model_settings, rounds)
+            as_it_stands = _fitted(features, as_logged, model_settings, rounds)
+            gain += as_read.log_likelihood() - as_it_stands.log_likelihood()
+        return gain
+
     plant = scenario.plant
     for one, other in combinations(range(len(plant.actions)), 2):
         words = f"columns {plant.actions[one]} and {plant.actions[other]} are exchanged"
-        exchanged = _exchanged(actions, one, other)
-        reading = _nominal_errors(features, states, exchanged, next_states)
-        gains[words] = reading.log_likelihood() - likelihood
+        other_reading = as_logged._replace(actions=_exchanged(as_logged.actions, one, other))
+        gains[words] = gain_of(other_reading)
     for one, other in combinations(range(len(plant.states)), 2):
         words = f"columns {plant.states[one]} and {plant.states[other]} are exchanged"
-        exchanged = _exchanged(states, one, other)
-        followers = _exchanged(next_states, one, other)
-        reading = _nominal_errors(features, exchanged, actions, followers)
-        gains[words] = reading.log_likelihood() - likelihood
+        other_reading = as_logged._replace(
+            states=_exchanged(as_logged.states, one, other),
+            next_states=_exchanged(as_logged.next_states, one, other),
+        )
+        gains[words] = gain_of(other_reading)
     best = max(gains, key=lambda words: gains[words])
     if gains[best] > settings.misreading_evidence:
         raise LoggedDataError(
@@ -186,6 +218,58 @@ def _check_order(
             f"{gains[best]:.0f} nats; correct the file (a dead time of the plant belongs in the "
             "model)"
         )
+
+
+class _Reading(NamedTuple):
+    """M transitions as one reading of the log has them.
+
+    Attributes:
+        states: (M, n).
+        actions: (M, m).
+        next_states: (M, n).
+    """
+
+    states: Array
+    actions: Array
+    next_states: Array
+
+
+def _fitted(
+    features: Features,
+    reading: _Reading,
+    settings: EmpiricalModelConfiguration,
+    rounds: int,
+) -> _Errors:
+    """Errors of the model whose parameters fit a reading best.
+
+    Args:
+        features: the nominal model.
+        reading: transitions.
+        settings: prior of the parameters' errors.
+        rounds: number of fits, the first of which is the nominal model.
+    """
+    inputs = np.column_stack([reading.states, reading.actions])
+    n = reading.states.shape[1]
+    c: Array = np.zeros(features.n_parameters)
+    precision = np.eye(len(c)) / settings.parameter_deviation**2
+    fits = []
+    for _ in range(rounds):
+        y, G, h = features(inputs, c)
+        sizes = h[:, :n]
+        errors = (reading.next_states - y[:, :n]) / sizes
+        rounding = INTEGRATION_ERROR * np.abs(y[:, :n]) / sizes
+        fit = _Errors(errors, rounding, sizes)
+        fits.append(fit)
+        # One Gauss-Newton step, each output weighted as it errs.
+        design = G[:, :n] / sizes[:, :, None]
+        target = errors + design @ c
+        weighted = np.linalg.solve(fit.covariance, design)
+        normal = np.tensordot(weighted, design, axes=((0, 1), (0, 1)))
+        moment = np.tensordot(weighted, target, axes=((0, 1), (0, 1)))
+        solution = np.linalg.solve(normal + precision, moment)
+        largest = settings.largest_parameter_error
+        c = np.asarray(solution.clip(-largest, largest))
+    return max(fits, key=_Errors.log_likelihood)
 
 
 def _unbroken_rows(data: LoggedData, reach: int) -> NDArray[np.intp]:

@@ -158,7 +158,7 @@ def _check_order(
     What is asked is whether the model explains the states better when the log is read otherwise. Of
     shifts it is the nominal model, since a fitted one would find the controller's own law in inputs
     of the next row. Of exchanged columns it is the model with its parameters fitted to each
-    reading, too: two inputs of nearly one size may undo an error of a parameter.
+    reading, too.
     """
     rows = _unbroken_rows(data, settings.largest_shift)
     if len(rows) < 10 * features.n_outputs:
@@ -179,25 +179,19 @@ def _check_order(
     thinning = max(len(rows) // model_settings.fit_samples, 1)
     as_logged = _Reading(states[::thinning], actions[::thinning], next_states[::thinning])
 
-    # Fitted parameters may explain a wrong unit: of that the nominal model says more.
-    changes = (next_states - states) / as_it_is.sizes
-    spreads = np.sqrt(np.mean(changes**2, axis=0)).tolist()
-    numbers_of_rounds = [1, model_settings.fit_rounds]
-    for errors, spread in zip(as_it_is.errors.T, spreads, strict=True):
-        if _is_unlike(errors, spread, settings):
-            numbers_of_rounds = [1]
-
     def gain_of(reading: _Reading) -> float:
         """By how many nats the model explains this reading better than the log as it is.
 
-        The fitted model must explain it better by more than the nominal one explains it worse.
+        The least of the nominal model's and of the fitted one's: two inputs of nearly one size may
+        undo an error of a parameter, and parameters that are fitted may explain a wrong unit.
         """
-        gain = 0.0
-        for rounds in numbers_of_rounds:
+        gains_of_rounds = []
+        for rounds in (1, model_settings.fit_rounds):
             as_read = _fitted(features, reading, model_settings, rounds)
             as_it_stands = _fitted(features, as_logged, model_settings, rounds)
-            gain += as_read.log_likelihood() - as_it_stands.log_likelihood()
-        return gain
+            gain = as_read.log_likelihood() - as_it_stands.log_likelihood()
+            gains_of_rounds.append(gain)
+        return min(gains_of_rounds)
 
     plant = scenario.plant
     for one, other in combinations(range(len(plant.actions)), 2):

@@ -1,43 +1,57 @@
-"""`cosim demo`: a training, and its θ beside naive, tuned and optimal control, in seconds."""
+"""`cosim demo`: two rules learn on a plant unlike their model; a table of what that gains."""
 
 from __future__ import annotations
 
 import shutil
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import cosim
 from cosim.cli import output as cli
+from cosim.cli.evaluate import PairsOption, show_evaluation
+
+if TYPE_CHECKING:
+    from learning.training import Training
 
 SCENARIO = "fouled"
-LEARNED = "learned"
-BACKED_OFF = "tuned + back-off"
-BACK_OFF_SAMPLES = 8000
+START = "cautious"
+"""The untrained controller from which both rules start."""
+UNTRAINED = ("naive", "backed-off", START)
+RULES = ("q-learning", "model-based")
+BEST = "model-based"
+"""The rule whose controller is drawn and recorded."""
+DAY = 1440
+"""Samples of a day: one a minute."""
 COMPARED_RUNS = 10
 """Runs of the comparison; the first is drawn and recorded."""
 
 
 def demo(
-    samples: Annotated[int, typer.Option(min=1000, max=1_000_000)] = 20_000,
-    steps: cli.StepsOption = 500,
+    samples: Annotated[int, typer.Option("--samples", "-n", min=100, max=1_000_000)] = DAY,
+    steps: cli.StepsOption = 1000,
     seed: cli.SeedOption = 0,
+    pairs: PairsOption = False,
     out: cli.OutOption = Path("cosim-demo"),
     json: cli.JsonOption = False,
 ) -> None:
-    """Let a controller whose model is wrong learn from its plant, and compare it.
+    """Let two rules learn on a plant unlike their model, and compare what they learned.
 
-    The condenser of the evaporator is fouled and no controller is told. Writes
-    evaluation.csv, evaluation.png, timing.csv, summary.json, before-after.png, demo.rrd, and of the
-    training learning.csv, learning.png, training.rrd, parameters.toml and scenario.toml.
+    The condenser of the evaporator is fouled, and no controller knows. Three controllers are not
+    trained. Two rules start from one of them, cautious, and learn on the plant. The last
+    controller is the optimum, which knows the plant.
+
+    Writes evaluation.csv, evaluation.png, before-after.png, demo.rrd, timing.csv, scenario.toml and
+    summary.json. The folder of each rule holds its parameters.toml, learning.csv, learning.png and
+    training.rrd.
 
     Args:
-        samples: Plant samples of learning.
+        samples: Plant samples of learning; default: a day.
+        steps: Samples of each run of the comparison.
     """
     with cli.output(json) as out_:
-        from cosim.cli.evaluate import show_evaluation
         from cosim.core.files import staged, temporary_folder
         from cosim.core.training_options import HELD_OUT
         from cosim.core.trajectory import RunSignals
@@ -48,57 +62,90 @@ def demo(
         scenario = cosim.Scenario.load(SCENARIO)
         folder = cli.open_folder(out)
         out_.note(scenario.description)
-        trained = {}
-        # The search of a back-off takes no more samples, however long the other learns.
-        for name, rule, number in (
-            (BACKED_OFF, "backoff", BACK_OFF_SAMPLES),
-            (LEARNED, "q-learning", samples),
-        ):
-            # Ten points of the learning curve.
-            every = max(1, number // 10)
-            trained[name] = cosim.train(
-                rule,
-                SCENARIO,
-                number,
-                seed=seed,
-                start="tuned",
-                log_every=every,
-                evaluate_every=every,
-                checkpoint_every=every,
-                progress=out_.live,
-            )
+        trained = _train(samples, seed, out_)
         # Noise that no training met.
         first = 2 * HELD_OUT + seed
         runs = {}
         signals = {}
         with temporary_folder("cosim-demo-") as work, cosim.FmuPlant(scenario) as plant:
             # In the order of the table.
-            named = {"naive": "naive", BACKED_OFF: "", LEARNED: "", "optimal": "optimal"}
+            named = {name: name for name in UNTRAINED}
             for name, training in trained.items():
-                file = work / f"{training.run.algorithm}.toml"
-                named[name] = str(training.parameters.save(file))
+                named[name] = str(training.parameters.save(work / f"{name}.toml"))
+            named["optimal"] = "optimal"
             seeds = range(first, first + COMPARED_RUNS)
             evaluation = cosim.evaluate(scenario, named, seeds, steps, progress=out_.live)
-            for name in ("naive", LEARNED, "optimal"):
+            for name in ("naive", START, BEST, "optimal"):
                 controller = cosim.build_controller(named[name], scenario)
                 run = cosim.simulate(plant, controller, steps, first)
                 runs[name] = run
                 signals[name] = RunSignals(name, run.signals, run.status, scenario.limits)
-        summary = evaluation.summary() | {"training": trained[LEARNED].summary()}
+        summary: dict[str, Any] = evaluation.summary()
+        summary["training"] = {name: training.summary() for name, training in trained.items()}
         with staged(folder) as stage:
             evaluation.write_files(stage)
             save(overlay_figure(runs), stage / "before-after.png")
-            trained[LEARNED].write_files(stage)
             record_overlay(stage / "demo.rrd", signals, scenario.description)
-            record_training(stage / "training.rrd", trained[LEARNED])
+            for name, training in trained.items():
+                files = stage / name
+                files.mkdir()
+                training.write_files(files)
+                record_training(files / "training.rrd", training)
             cli.write_summary(stage, summary)
-        show_evaluation(summary, out_)
+        data = {name: "none" for name in UNTRAINED}
+        for name in RULES:
+            data[name] = f"{samples} samples"
+        data["optimal"] = "the plant"
+        show_evaluation(summary, out_, pairs, data)
+        for name in RULES:
+            out_.note(_gain(summary, name, samples))
         # `make demo` activates no environment.
         command = "cosim" if shutil.which("cosim") else f"{sys.executable} -m cosim"
         out_.note(
-            f"pictures   {folder / 'before-after.png'}, {folder / 'learning.png'}\n"
-            f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}\n"
-            f"learned θ   {folder / 'parameters.toml'} (a controller in every command)\n"
-            f"look at the recording with: {command} view {folder / 'demo.rrd'}"
+            f"pictures   {folder / 'before-after.png'}, {folder / BEST / 'learning.png'}\n"
+            f"learned θ  {folder / BEST / 'parameters.toml'} (a controller in every command)\n"
+            f"recording  {command} view {folder / 'demo.rrd'}"
         )
         out_.json(summary)
+
+
+def _train(samples: int, seed: int, output: cli.Output) -> dict[str, Training]:
+    """Train each rule from the start, on the same noise."""
+    trained = {}
+    # Twelve rows of the log, and three points of the learning curve.
+    log_every = max(1, samples // 12)
+    evaluate_every = 4 * log_every
+    for rule in RULES:
+        trained[rule] = cosim.train(
+            rule,
+            SCENARIO,
+            samples,
+            seed=seed,
+            start=START,
+            log_every=log_every,
+            evaluate_every=evaluate_every,
+            checkpoint_every=samples,
+            progress=output.live,
+        )
+    return trained
+
+
+def _gain(summary: dict[str, Any], name: str, samples: int) -> str:
+    """A sentence: whether a rule's θ costs less than its start on the runs of the comparison."""
+    (pair,) = [
+        comparison
+        for comparison in summary["comparisons"]
+        if (comparison["controller"], comparison["reference"]) == (name, START)
+    ]
+    gain = pair["gain_in_J"]
+    low, high = gain["bootstrap"] or gain["interval"]
+    if low > 0:
+        verdict = "costs less than"
+    elif high < 0:
+        verdict = "costs more than"
+    else:
+        verdict = "cannot be told from"
+    return (
+        f"{name} after {samples} samples {verdict} {START}: "
+        f"{100 * gain['value']:.2f} % [{100 * low:.2f}, {100 * high:.2f}]"
+    )

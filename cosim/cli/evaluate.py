@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from itertools import compress
+from collections.abc import Mapping
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +14,10 @@ import cosim
 from cosim.cli import output as cli
 from cosim.core.files import staged, write_atomically
 
+PairsOption = Annotated[
+    bool, typer.Option("--pairs", help="Print the paired difference of each two controllers too.")
+]
+
 
 def evaluate(
     controllers: Annotated[list[str], typer.Option("--controllers", "-c")] = ["naive"],  # noqa: B006
@@ -23,6 +27,7 @@ def evaluate(
     steps: cli.StepsOption = 2500,
     out: cli.OutOption = Path("cosim-evaluation"),
     trajectories: Path | None = None,
+    pairs: PairsOption = False,
     jobs: cli.JobsOption = None,
     scheduler: cli.SchedulerOption = None,
     json: cli.JsonOption = False,
@@ -79,7 +84,7 @@ def evaluate(
         with staged(folder, EVALUATION_FILES) as stage:
             evaluation.write_files(stage)
             cli.write_summary(stage, summary)
-        show_evaluation(summary, out_)
+        show_evaluation(summary, out_, pairs)
         out_.note(f"files are in {folder.resolve()}")
         out_.json(summary)
 
@@ -126,59 +131,74 @@ def _evaluate_trajectories(
     output.json(summary)
 
 
-def show_evaluation(summary: dict[str, Any], output: cli.Output) -> None:
-    """Print the table of controllers and the paired comparisons.
+def show_evaluation(
+    summary: dict[str, Any],
+    output: cli.Output,
+    pairs: bool,
+    data: Mapping[str, str] | None = None,
+) -> None:
+    """Print a row for each controller, within 80 columns.
 
     Args:
         summary: `Evaluation.summary`.
         output: of the command.
+        pairs: whether each pair of controllers is compared in a second table.
+        data: what each controller was made from, by its name; None leaves the column out.
     """
     from cosim.core.statistics import shown
 
-    header = (
-        "controller", "J", "regret %", "economic cost", "violating %", "failures", "step µs",
-    )  # fmt: skip
+    header = ["controller", "regret %", "J", "violating %"]
     rows = []
     for name, row in summary["controllers"].items():
-        timing = summary["timing"][name]
-        # What the controller takes of a sample; the plant's time is no merit of it.
-        step = timing["prepare_median_us"] + timing["feedback_median_us"]
-        cells = (
+        cells = [
             name,
-            shown(row["J"], digits=6),
             _interval(row.get("regret"), 100.0),
-            shown(row["economic_cost"], digits=6),
+            shown(row["J"], digits=6),
             f"{100 * row['violating_share']:.2f}",
-            str(row["failures"]),
-            f"{step:.0f}",
-        )
+        ]
         rows.append(cells)
-    # A column that is known of no controller is left out.
-    known = [any(column) for column in zip(*rows, strict=True)]
-    titles = list(compress(header, known))
-    lines = [list(compress(row, known)) for row in rows]
+    n_failures = [row["failures"] for row in summary["controllers"].values()]
+    if any(n_failures):
+        header.append("failures")
+        for cells, number in zip(rows, n_failures, strict=True):
+            cells.append(str(number))
+    if data is None:
+        header.append("economic cost")
+        for cells in rows:
+            cost = summary["controllers"][cells[0]]["economic_cost"]
+            cells.append(shown(cost, digits=6))
+    else:
+        # It takes the economic cost's room.
+        header.insert(1, "data")
+        for cells in rows:
+            cells.insert(1, data[cells[0]])
+    if summary["optimum"] is None:
+        column = header.index("regret %")
+        for cells in (header, *rows):
+            del cells[column]
     n_seeds = len(summary["seeds"])
     title = f"{summary['scenario']}, {summary['steps']} samples × {n_seeds} seeds"
-    output.table(title, titles, lines)
+    output.table(title, header, rows)
     if "remark" in summary:
         output.note(summary["remark"])
     if summary["optimum"] is not None:
         output.note(
-            "regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "
-            f"{shown(summary['optimal_J'], digits=6)}"
+            "regret = (J − J*)/|J*| with its 95 % interval over the seeds; "
+            f"J* = {shown(summary['optimal_J'], digits=6)}"
         )
-    pairs = []
+    if pairs:
+        _show_pairs(summary, output)
+
+
+def _show_pairs(summary: dict[str, Any], output: cli.Output) -> None:
+    """Print the paired difference of each two controllers."""
+    rows = []
     for comparison in summary["comparisons"]:
-        pair = f"{comparison['controller']} − {comparison['reference']}"
         difference = _interval(comparison["differences"]["J"])
         gain = _interval(comparison["gain_in_J"], 100.0)
-        pairs.append((pair, difference, gain))
-    if pairs:
-        output.table(
-            "paired comparisons (95 % interval over seeds)",
-            ("controller against reference", "ΔJ", "gain in J %"),
-            pairs,
-        )
+        rows.append((comparison["controller"], comparison["reference"], difference, gain))
+    header = ("controller", "against", "difference in J", "gain in J %")
+    output.table("paired over the seeds, with 95 % intervals", header, rows)
 
 
 def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:
@@ -187,4 +207,8 @@ def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:
 
     if estimate is None or not isfinite(estimate["value"]):
         return ""
-    return shown(estimate["value"], estimate["interval"], scale, 3)
+    # The cost of rare violations is skewed: the bootstrap's interval holds no impossible regret.
+    interval = estimate.get("bootstrap") or estimate["interval"]
+    # The interval's width says how many digits of the value mean anything.
+    digits = 3 if interval is None else 1
+    return shown(estimate["value"], interval, scale, digits)

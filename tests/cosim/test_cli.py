@@ -9,21 +9,31 @@ import pytest
 def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_path):
     folders = [tmp_path / "a", tmp_path / "b"]
     for folder in folders:
-        code, out, err = cosim("demo", "--samples", 4000, "--steps", 100, "--out", folder, "--json")
+        code, out, err = cosim("demo", "--samples", 480, "--steps", 1000, "--out", folder, "--json")
         assert code == 0, err
     summary = json.loads(out)
     rows = summary["controllers"]
-    assert set(rows) == {"naive", "tuned + back-off", "learned", "optimal"}
-    assert rows["optimal"]["J"] < rows["learned"]["J"] < rows["naive"]["J"]
+    untrained = {"naive", "backed-off", "cautious"}
+    rules = {"q-learning", "model-based"}
+    assert set(rows) == untrained | rules | {"optimal"}
+    # The story of README: caution costs little, and a rule takes most of that.
+    assert rows["naive"]["J"] > rows["backed-off"]["J"] > rows["cautious"]["J"]
+    assert rows["cautious"]["J"] > rows["model-based"]["J"]
     assert rows["naive"]["violating_share"] > 0.3
-    assert summary["training"]["plant_samples"] == 4000
-    names = {path.name for path in folders[0].iterdir()}
-    pictures = {"before-after.png", "evaluation.png", "learning.png"}
-    tables = {"evaluation.csv", "learning.csv", "timing.csv", "summary.json"}
-    documents = {"parameters.toml", "scenario.toml", "demo.rrd", "training.rrd"}
-    assert names == pictures | tables | documents
-    for name in names - {"demo.rrd", "summary.json", "timing.csv", "training.rrd"}:
-        assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes(), name
+    for rule in rules:
+        assert summary["training"][rule]["plant_samples"] == 480
+        assert summary["training"][rule]["start"] == "cautious"
+    files = [path for path in folders[0].rglob("*") if path.is_file()]
+    names = {path.relative_to(folders[0]).as_posix() for path in files}
+    expected = {"before-after.png", "evaluation.png", "evaluation.csv", "timing.csv"}
+    expected |= {"summary.json", "scenario.toml", "demo.rrd"}
+    of_a_rule = {"learning.png", "learning.csv", "parameters.toml", "scenario.toml", "training.rrd"}
+    for rule in rules:
+        expected |= {f"{rule}/{name}" for name in of_a_rule}
+    assert names == expected
+    for name in names - {"summary.json", "timing.csv"}:
+        if not name.endswith(".rrd"):
+            assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes(), name
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One process a core; tests of one file share what they build.
 PYTEST := $(BIN)/python -m pytest -n auto
 
-.PHONY: demo test check docs campaign platforms sanitised clean
+.PHONY: demo test check docs pictures campaign platforms sanitised clean
 
 demo: $(VENV)/installed
 	$(BIN)/cosim demo --out demo
@@ -34,6 +34,10 @@ build/figures: $(wildcard results/*.toml results/*/*.csv cosim/figures/* cosim/s
 # The documentation as a site, in build/site; any warning is an error.
 docs: build/figures
 	$(BIN)/python -m mkdocs build --strict --site-dir build/site
+
+# README's picture, from the stored tables; committed, since README is read without a build.
+pictures: $(VENV)/installed-dev
+	$(BIN)/python docs/pictures.py
 
 # What takes many minutes a test and is run by hand.
 campaign: $(VENV)/installed-dev

@@ -1,0 +1,65 @@
+"""Draw the pictures of README and the pages from the stored studies: `python docs/pictures.py`.
+
+Each is drawn from the tables in `results/`; none holds a figure of its own.
+"""
+
+from pathlib import Path
+
+import cosim
+from cosim.figures.bars import Bar, bars_figure
+from cosim.figures.style import REFERENCE, palette, save
+
+ROOT = Path(__file__).parents[1]
+IMAGES = ROOT / "docs" / "images"
+SCENARIO = "fouled"
+HOUR = 60
+"""Samples: one a minute."""
+RULES = {
+    "offset-free MPC": ("operation-week", "offset-free(start=cautious)"),
+    "Q-learning": ("operation-intercept", "q-learning(start=cautious)"),
+    "model-based rule": ("operation-week", "model-based(start=cautious)"),
+}
+"""Study and case of each name in the picture; all start from cautious."""
+UNTRAINED = {
+    "naive MPC": ("operation-week", "fixed(start=naive)"),
+    "backed-off MPC": ("operation-week", "fixed(start=backed-off)"),
+    "cautious MPC": ("operation-week", "fixed(start=cautious)"),
+}
+
+
+def regrets(study: str) -> dict[tuple[str, int], float]:
+    """Median greedy regret over the training seeds in %, by case and samples."""
+    results = cosim.StudyResults.load(ROOT / "results" / study)
+    runs = results.operation_result(SCENARIO).runs
+    medians = runs.groupby(["case", "samples"]).regret.median()
+    return {key: 100 * value for key, value in medians.items()}
+
+
+def draw_regret() -> None:
+    """Regret without data, after a day, after a week: what README shows first."""
+    tables = {name: regrets(name) for name in ("operation-week", "operation-intercept")}
+    cases = [case for _, case in RULES.values()]
+    colors = palette(cases)
+    groups = {}
+    for heading, members, hours in (
+        ("No data: the controller's model alone", UNTRAINED, 24),
+        ("After one day of operation", RULES, 24),
+        ("After one week", RULES, 168),
+    ):
+        bars = []
+        for name, (study, case) in members.items():
+            regret = tables[study][case, hours * HOUR]
+            # A rule has its colour of all figures; what has not learned is grey.
+            color = colors[case].color if members is RULES else REFERENCE
+            bars.append(Bar(name, regret, color))
+        groups[heading] = bars
+    figure = bars_figure(
+        groups,
+        title="How far is each controller from the best possible?",
+        axis_label="cost above the least possible, in % (log scale)",
+    )
+    save(figure, IMAGES / "regret.png")
+
+
+if __name__ == "__main__":
+    draw_regret()

@@ -285,8 +285,9 @@ def _run_app() -> None:
         if isinstance(error, MemoryError):
             _fail(f"not enough memory ({error}); ask for fewer samples")
         if isinstance(error, ModuleNotFoundError):  # of a plug-in it is an error of its own
-            package = "rerun-sdk" if error.name == "rerun" else error.name
-            _fail(f"the package '{package}' is not installed: pip install {package}")
+            if error.name in ("rerun", "pyarrow"):
+                _fail("the viewer of recordings is not installed: pip install 'rti-cosim[view]'")
+            _fail(f"the package '{error.name}' is not installed: pip install {error.name}")
         if isinstance(error, OSError):
             name = f"'{error.filename}': " if error.filename else ""
             _fail(f"{name}{error.strerror or error}")

@@ -124,7 +124,7 @@ def _viewer() -> list[str]:
     """The viewer's own program: `python -m rerun` would start it as a grandchild."""
     command = find_spec("rerun_cli")
     if command is None or command.origin is None:
-        raise RecordingError("the viewer is not installed; install rerun-sdk")
+        raise RecordingError("the viewer is not installed: pip install 'rti-cosim[view]'")
     folder = Path(command.origin).parent
     program = folder / ("rerun.exe" if os.name == "nt" else "rerun")
     # On macOS it is an application.

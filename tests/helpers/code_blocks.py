@@ -1,5 +1,6 @@
 """Fenced code blocks of a Markdown page, and how each kind is executed."""
 
+import contextlib
 import doctest
 import importlib
 import importlib.util
@@ -27,7 +28,14 @@ COVERED = {
     "make test": "the target is run by .ci/run",
     "python3 -m venv .venv": "tests/packaging installs into an empty environment",
     ". .venv/bin/activate": "tests/packaging installs into an empty environment",
+    "git clone REPOSITORY rti-cosim && cd rti-cosim": "no public address is known",
+    "python3 -m venv .venv && . .venv/bin/activate": (
+        "tests/packaging installs into an empty environment"
+    ),
     "pip install .": "tests/packaging installs the wheel into an empty environment",
+    "pip install -c constraints.txt '.[view]'": (
+        "tests/packaging installs the wheel into an empty environment"
+    ),
     "pip install '.[cluster]'": "installed by `make test`",
     "cosim view demo/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim view run/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
@@ -106,6 +114,7 @@ class Session:
         self.page, self.folder = page, folder
         self.namespace: dict[str, object] = {"__name__": "page"}
         self.commands = 0
+        self.printed = ""  # by the Python block before
         self.environment = os.environ | {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         }
@@ -126,9 +135,14 @@ class Session:
             if first and importlib.util.find_spec(first[1]) is None:
                 return  # an extra that is not there
             code = compile("\n" * block.line + block.text, where, "exec", dont_inherit=True)
-            with warnings.catch_warnings():
+            printed = io.StringIO()
+            with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
                 warnings.simplefilter("error")
                 exec(code, self.namespace)
+            self.printed = printed.getvalue()
+        elif kind == "text" and block.options == "output":
+            fits = CHECKER.check_output(block.text, self.printed, FLAGS)
+            assert fits, f"{where}: expected\n{block.text}\ngot\n{self.printed}"
         elif kind == "console":
             self._type(block.text, where)
         elif kind == "toml":

@@ -79,6 +79,15 @@ def installed(wheel, python):
     return python
 
 
+@pytest.fixture(scope="module")
+def with_viewer(installed, wheel):
+    """The same environment, and the viewer of recordings in it."""
+    extra = f"rti-cosim[view] @ {wheel.as_uri()}"
+    lock = ROOT / "constraints.txt"
+    run(installed, "-m", "pip", "install", "--quiet", "-c", lock, extra, cwd=wheel.parent)
+    return installed
+
+
 def bare_environment(python):
     """A path on which there is no compiler, and nothing that leads back to the checkout."""
     home = os.environ.get("HOME", "/")
@@ -142,11 +151,10 @@ def test_the_command_works_outside_the_checkout(installed, tmp_path):
 def test_a_run_needs_no_compiler(installed, tmp_path):
     env = bare_environment(installed)
     env["COSIM_CACHE"] = str(tmp_path / "cache")
-    words = ("simulate", "--steps", "1000", "--record", "--json", "--out", "run")
+    words = ("simulate", "--steps", "1000", "--json", "--out", "run")
     summary = json.loads(run(installed, "-m", "cosim", *words, cwd=tmp_path, env=env))
     assert (summary["failures"], summary["samples"]) == (0, 1000)
     assert summary["timing"]["functions"] == "compiled"
-    assert (tmp_path / "run" / "run.rrd").stat().st_size > 10_000
 
 
 def test_the_installed_results_hold(installed, tmp_path):
@@ -154,3 +162,21 @@ def test_the_installed_results_hold(installed, tmp_path):
     words = ("results", "check", "closed-loop", "--json")
     result = json.loads(run(installed, "-m", "cosim", *words, cwd=tmp_path, env=env))
     assert result["same"] is True
+
+
+def test_without_the_viewer_a_recording_says_what_to_install(installed, tmp_path):
+    words = [installed, "-m", "cosim", "simulate", "--steps", "20", "--record", "--out", "run"]
+    environment = bare_environment(installed)
+    result = subprocess.run(
+        words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 2
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert "rti-cosim[view]" in result.stderr
+
+
+def test_with_the_viewer_a_run_is_recorded(with_viewer, tmp_path):
+    env = bare_environment(with_viewer)
+    words = ("simulate", "--steps", "20", "--record", "--json", "--out", "run")
+    run(with_viewer, "-m", "cosim", *words, cwd=tmp_path, env=env)
+    assert (tmp_path / "run" / "run.rrd").stat().st_size > 10_000

@@ -1,0 +1,117 @@
+"""The figures that README and docs/ state are those of the stored tables."""
+
+import csv
+import re
+from collections import defaultdict
+from statistics import median
+
+import pytest
+
+from tests.helpers.code_blocks import ROOT, pages
+
+SAMPLES = {"8 h": 480, "1 day": 1440, "1 week": 10080, "4 weeks": 40320}
+WRONG_MODEL = ("fouled", "mismatched")
+MAIN = ("fouled", "mismatched", "paper")
+README = " ".join((ROOT / "README.md").read_text().split())
+MARKED = re.compile(r"<!-- (greedy|run) of (\S+) -->\n((?:\|.*\n)+)")
+
+
+def rows(study, table):
+    with (ROOT / "results" / study / f"{table}.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def regrets(study, kind="greedy"):
+    """Regret in % of each run, by (scenario, case, samples): of its θ, or of all its samples."""
+    costs = defaultdict(list)
+    table = "greedy" if kind == "greedy" else "operation"
+    for row in rows(study, table):
+        key = row["scenario"], row["case"], int(row["samples"])
+        costs[key, row["training_seed"]].append(float(row["J"]))
+    result = defaultdict(list)
+    for (key, seed), values in costs.items():
+        scenario, case, samples = key
+        if case == "optimal":
+            continue
+        # Greedy runs share their noise; a run in operation has the noise of its training seed.
+        optimum = costs[(scenario, "optimal", samples), "" if kind == "greedy" else seed]
+        result[key].append(100 * (sum(values) / sum(optimum) - 1))
+    return result
+
+
+def after_a_week(study, case, scenarios):
+    table = regrets(study)
+    return [value for name in scenarios for value in table[name, case, 10080]]
+
+
+def test_the_headline_on_q_learning_is_stored():
+    with_intercept = after_a_week("operation-intercept", "q-learning(start=naive)", WRONG_MODEL)
+    without = after_a_week(
+        "operation-intercept", "q-learning-without-intercept(start=naive)", WRONG_MODEL
+    )
+    assert len(with_intercept) == 20 and max(with_intercept) < 20
+    assert "all 20 runs are below 20 % of regret" in README
+    assert f"{sum(value < 1 for value in with_intercept)} below 1 %" in README
+    assert f"{sum(value > 100 for value in without)} of 20 run away" in README
+    week = regrets("operation-intercept", "run")["fouled", "q-learning(start=naive)", 10080]
+    assert f"{median(week):.0f} % of regret in the median" in README
+
+
+def test_the_headline_on_the_model_based_rule_is_stored():
+    values = [
+        value
+        for start in ("cautious", "naive")
+        for value in after_a_week("operation-week", f"model-based(start={start})", MAIN)
+    ]
+    assert len(values) == 60 and max(values) < 0.1
+    assert "all 60 runs" in README and "within 0.1 % of the optimum" in README
+    table = regrets("operation-week", "run")
+    cheaper = [
+        learned < fixed
+        for name in MAIN
+        for learned, fixed in zip(
+            table[name, "model-based(start=cautious)", 10080],
+            table[name, "fixed(start=cautious)", 10080],
+            strict=True,
+        )
+    ]
+    assert all(cheaper) and f"in all {len(cheaper)} runs" in README
+
+
+def test_the_headline_on_cautious_control_is_stored():
+    right = max(after_a_week("operation-week", "fixed(start=cautious)", MAIN))
+    assert f"`cautious` has at most {right:.2f} % of regret" in README
+    wrong = regrets("operation-gains")
+    assert f"it has {median(wrong['holdup', 'fixed', 10080]):.0f} %" in README
+    assert f"comes to {median(wrong['holdup', 'model-based', 10080]):.2f} %" in README
+
+
+def written(value):
+    """The ways in which the pages write a figure."""
+    return {f"{value:.{digits}f}" for digits in (0, 1, 2)}
+
+
+def marked_tables():
+    for page in pages():
+        for kind, study, text in MARKED.findall(page.read_text()):
+            head, _, *lines = [
+                [cell.strip() for cell in line.strip("|\n ").split("|")]
+                for line in text.splitlines()
+            ]
+            for line in lines:
+                name = f"{page.name}-{study}-{line[0]}"
+                yield pytest.param(kind, study, head, line, id=name)
+
+
+@pytest.mark.parametrize(("kind", "study", "head", "line"), list(marked_tables()))
+def test_every_row_of_a_marked_table_is_stored(kind, study, head, line):
+    """A column is headed "`scenario`, time"; a cell is "median" or "median (worst)"."""
+    table = regrets(study, kind)
+    case = re.search(r"`([^`]+)`$", line[0])[1]
+    for column, cell in zip(head[1:], line[1:], strict=True):
+        scenario, time = re.fullmatch(r"`([^`]+)`, (.+)", column).groups()
+        values = table[scenario, case, SAMPLES[time]]
+        assert values, f"{study} has no {scenario}, {case}, {time}"
+        middle, worst = re.fullmatch(r"([-\d.]+)(?: \(([-\d.]+)\))?", cell).groups()
+        assert middle in written(median(values)), (column, cell, median(values))
+        assert worst is None or worst in written(max(values)), (column, cell, max(values))

@@ -1,7 +1,7 @@
 # Both targets need Python 3.11 or newer and nothing else: they make their own .venv.
 PYTHON ?= python3
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # One process a core; tests of one file share what they build.
 PYTEST := $(BIN)/python -m pytest -n auto
 
@@ -51,10 +51,10 @@ platforms: $(VENV)/installed-dev
 sanitised: $(VENV)/installed
 	$(PYTEST) -m sanitised
 
-$(VENV)/bin/python:
+$(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	touch $@
 

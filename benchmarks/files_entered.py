@@ -1,7 +1,7 @@
 """`python -m benchmarks.files_entered`: the files to open for a step, for `evaluate`, for export.
 
 A file counts where one of its functions is called, anywhere down the chain of calls; what runs
-while a module is imported does not count. docs/architecture.md has the figures.
+while a module is imported does not count.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Bytes that the exported controller takes on micro-controllers: python -m benchmarks.footprint.
 
-By clang -Os of the extra ``cross``; the table is in docs/how-to/microcontroller.md.
+By clang -Os of the extra ``cross``; the table is in docs/how-to/deploy.md.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Each FMU is stepped by `FmuPlant` and simulated by `fmpy.simulate_fmu` under the
 start values held, then a varied table. All numbers among its outputs after each of 20 steps are
 compared bit by bit. A row says `same`; where, by how much and why they differ; or the line by which
 the FMU was refused. The FMUs are native code that this runs, each in a process of its own.
-docs/how-to/fmu.md says where to get some.
+docs/reference/scenario.md says where to get some.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Write docs/reference/platforms.md: python -m benchmarks.platforms [FILE].
+"""Write benchmarks/platforms.md: python -m benchmarks.platforms [FILE].
 
 Runs every binary that can be run here and every importer that is installed; takes some minutes.
 """
@@ -25,7 +25,7 @@ from tests.helpers.platforms import (
     verdict,
 )
 
-PAGE = Path(__file__).parents[1] / "docs" / "reference" / "platforms.md"
+PAGE = Path(__file__).parent / "platforms.md"
 NATURE = {"x86_64-linux": "natively", "aarch64-linux": "qemu-user", "x86_64-windows": "wine64"}
 
 

@@ -1,7 +1,7 @@
 """Errors of the plain C in single precision: python -m benchmarks.single.
 
 What `cosim export --format c --single` writes is compared with the C in double precision;
-docs/how-to/microcontroller.md has the table.
+benchmarks/performance.md has the table.
 """
 
 from __future__ import annotations

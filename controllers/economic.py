@@ -756,7 +756,7 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
     value; c_λ is ℓ_s. θ is rounded to six digits.
 
     Where no convex cost has the economic one's local optimum, the least quadratic is added to it,
-    and a TuningWarning says so once (docs/how-to/when-tuning-fails.md).
+    and a TuningWarning says so once (docs/how-to/your-plant.md).
 
     Args:
         problem: The control problem.

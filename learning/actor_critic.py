@@ -133,7 +133,7 @@ class ActorCritic(Algorithm):
     with f and ℓ the controller's nominal model and e_i its latest prediction errors. w has a prior,
     so that it corrects the model where the samples say so. The step is that of Gauss and Newton
     with the Hessian E[∇π ∇²_a Q ∇πᵀ] (Brandner, Gros and Lucia, arXiv 2508.02441) in a trust
-    region, which bounds the change of the action (docs/method.md).
+    region, which bounds the change of the action (docs/rules/actor-critic.md).
     """
 
     learns_from_estimates = True

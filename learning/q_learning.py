@@ -217,7 +217,7 @@ def prior_deviation(
 
     With B a Hessian of the start, D = diag(B)^½ and κ = max_i B_ii σ_i² the cost of the most
     expensive typical move, entries of B get w·D_i D_j and gradients w·D_i √κ, with w the
-    `prior_width` (docs/method.md).
+    `prior_width` (docs/rules/q-learning.md).
 
     Args:
         start: θ at the start.
@@ -364,7 +364,7 @@ class QLearning(ValueRule):
 
     with f the controller's nominal model and e_i its latest prediction errors. Every `step_every`
     samples θ moves by d under its constraints, in the metric P⁻¹. The warm-up of `prior_samples`
-    moves only c_f, which becomes the mean of e (docs/method.md).
+    moves only c_f, which becomes the mean of e (docs/rules/q-learning.md).
     """
 
     learns_from_estimates = True
@@ -639,7 +639,7 @@ class AverageCost:
     - It is fitted with θ, in c_lambda's place.
     - It follows δ: each sample takes g ← g + δ/memory, differential Q-learning after Wan, Naik and
       Sutton (2021). The fit of θ is then one with an intercept that is forgotten: ∇Q loses its
-      running mean, for without that the mean pays the level of δ into θ (docs/method.md).
+      running mean, for without that the mean pays the level of δ into θ (docs/rules/q-learning.md).
     - It is the intercept of a batch (`centre`).
 
     Args:

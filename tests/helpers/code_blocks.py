@@ -66,7 +66,7 @@ SMALLER = {
     "\nsamples = 1000\n": "\nsamples = 250\n",
     "log_every = 250 }": "log_every = 50 }",
 }
-SLOW = {"scenario.md", "fmpy.md", "README.md"}
+SLOW = {"README.md"}
 CHECKER = doctest.OutputChecker()
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
@@ -82,8 +82,9 @@ class Block:
 
 
 def pages() -> list[Path]:
-    """README and every page of docs/."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    """README, every page of docs/, and the pages beside code."""
+    beside = ["README.md", "CONTRIBUTING.md", "examples/teaching.md"]
+    return [*(ROOT / name for name in beside), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(page: Path) -> list[Block]:

@@ -11,7 +11,7 @@ from tests.helpers.code_blocks import ROOT
 
 PAGES = {
     "rule": ("capped_td", "algorithm.md"),
-    "controller": ("proportional", "controller.md"),
+    "controller": ("proportional", "python.md"),
     "plant": ("heater", "your-plant.md"),
     "study": ("mine", "study.md"),
 }

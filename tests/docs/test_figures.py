@@ -10,6 +10,7 @@ import pytest
 
 from cosim import Scenario
 from tests.helpers.code_blocks import ROOT, pages
+from tests.helpers.command import run_cosim
 
 HOURS = {"8 h": 8, "1 day": 24, "1 week": 168, "4 weeks": 672, "25 days": 608}
 WEEK = 10080
@@ -95,6 +96,15 @@ def test_the_headline_on_cautious_control_is_stored():
     wrong = regrets("operation-gains")
     assert f"it has {median(wrong['holdup', 'fixed', WEEK]):.0f} %" in README
     assert f"comes to {median(wrong['holdup', 'model-based', WEEK]):.2f} %" in README
+
+
+@pytest.mark.campaign
+def test_the_demo_prints_the_table_of_readme(tmp_path):
+    result = run_cosim("demo", "--out", "demo", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    table = re.findall(r"^│.*│$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert len(table) == 6
+    assert [line for line in table if line not in result.stdout] == []
 
 
 def written(value):

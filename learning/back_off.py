@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -14,7 +15,7 @@ from pydantic import Field
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.core.protocols import Matrix, Vector
-from cosim.core.scenario import Positive, Scenario
+from cosim.core.scenario import Penalty, Positive, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, GreedyConfiguration, Share
@@ -70,6 +71,140 @@ class BackOffConfiguration(GreedyConfiguration):
     )
 
 
+class Round(NamedTuple):
+    """A round of the search: κ of one bound are tried, those of the others stay."""
+
+    bound: int
+    phase: Phase
+
+
+class Segment:
+    """Samples in a row at one θ.
+
+    Args:
+        length: how many, those at which the controller failed included.
+        n_bounds: number of bounds.
+
+    Attributes:
+        count: samples so far, failed ones included.
+        n_active: samples in which each bound was active, (2n,).
+    """
+
+    def __init__(self, length: int, n_bounds: int) -> None:
+        self.length = length
+        self.count = 0
+        self.n_active: Vector = np.zeros(n_bounds)
+        # Of each sample at which the controller did not fail:
+        self._numbers: list[int] = []
+        self._stage_costs: list[float] = []
+        self._states: list[list[float]] = []
+        self._actions: list[list[float]] = []
+        self._next_states: list[list[float]] = []
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the controller failed at all samples."""
+        return not self._numbers
+
+    def add(self, transition: Transition) -> None:
+        """Keep the present sample."""
+        self._numbers.append(self.count)
+        self._stage_costs.append(transition.stage_cost)
+        self._states.append(transition.s.tolist())
+        self._actions.append(transition.a.tolist())
+        self._next_states.append(transition.next_s.tolist())
+
+    def errors(self, model: OneStepModel, theta: Parameters) -> Matrix:
+        """One-step prediction errors of a model at θ, (K, n)."""
+        states = np.array(self._states)
+        actions = np.array(self._actions)
+        next_states = np.array(self._next_states)
+        return model.errors(states, actions, next_states, theta)
+
+    def settled(self, settling: int) -> Matrix:
+        """Rows (ℓ, s) of the samples after the first `settling`, (K, 1+n)."""
+        rows = []
+        for number, cost, state in zip(self._numbers, self._stage_costs, self._states, strict=True):
+            if number >= settling:
+                rows.append([cost, *state])
+        return np.array(rows)
+
+    def state_dict(self) -> State:
+        """The samples."""
+        return {
+            "length": self.length,
+            "count": self.count,
+            "n_active": self.n_active,
+            "numbers": np.array(self._numbers, int),
+            "stage_costs": np.array(self._stage_costs),
+            "states": np.array(self._states),
+            "actions": np.array(self._actions),
+            "next_states": np.array(self._next_states),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restore what `state_dict` returned."""
+        self.length = state["length"]
+        self.count = state["count"]
+        self.n_active = state["n_active"]
+        self._numbers = state["numbers"].tolist()
+        self._stage_costs = state["stage_costs"].tolist()
+        self._states = state["states"].tolist()
+        self._actions = state["actions"].tolist()
+        self._next_states = state["next_states"].tolist()
+
+
+@dataclass(frozen=True)
+class CostEstimate:
+    """The mean cost at any κ of a bound, from samples that were run at some.
+
+    A sample at one κ says what another one would cost: its states move with κ, their penalty is
+    known, and the rest of the cost has a slope.
+
+    Attributes:
+        kappa: κ of each sample, (K,).
+        states: its state, (K, n).
+        mean_cost: mean stage cost of all samples; κ share it, what differs is estimated.
+        cost_slope: of the stage cost, for a unit of κ.
+        state_slopes: of the states, (n,).
+        penalty: of the true bounds.
+        reach: how far, in κ, a sample speaks for another κ.
+    """
+
+    kappa: Vector
+    states: Matrix
+    mean_cost: float
+    cost_slope: float
+    state_slopes: Vector
+    penalty: Penalty
+    reach: float
+
+    def at(self, value: float) -> float:
+        """The cost at a κ within reach of a sample."""
+        # Samples far away speak for another place of the state.
+        distance = value - self.kappa
+        near = np.abs(distance) < self.reach
+        change_of_states = np.outer(distance[near], self.state_slopes)
+        moved = self.states[near] + change_of_states
+        penalty = known_penalty(self.penalty, moved).mean()
+        change = self.cost_slope * value + penalty
+        return float(self.mean_cost + change)
+
+    def best_of(self, values: Vector, plateau: float) -> float:
+        """The smallest κ of those that cost least.
+
+        Args:
+            values: κ to choose from, (M,).
+            plateau: costs that differ by this share are one.
+        """
+        costs = np.array([self.at(value) for value in values])
+        least = costs.min()
+        limit = least + plateau * abs(least)
+        cheapest = values[costs <= limit]
+        smallest = np.argmin(np.abs(cheapest))
+        return float(cheapest[smallest])
+
+
 class BackOffSearch:
     """Finds the κ of least cost for the active bounds x_l + κσ and x_u − κσ.
 
@@ -120,7 +255,6 @@ class BackOffSearch:
         self.settings = settings
         self._budget = budget
         self._n = n
-        self._n_columns = 2 + 2 * n + problem.n_actions
         self._settling = problem.horizon  # samples of a segment that do not count
         self._penalty = scenario.state_penalty
         self._model = OneStepModel(scenario)
@@ -137,13 +271,13 @@ class BackOffSearch:
         self.led_beyond = False
         self._unit: Vector = np.zeros(n)  # σ, known after the first segment
         self._active: Vector = np.zeros(2 * n)  # largest share of a first round's segment
-        # Rounds (bound, Phase); the first segment finds the bound of the first.
-        self._schedule: list[list[int]] = []
+        # The first segment is at κ = 0: it finds σ, and the bound that the first round is about.
+        self._schedule: list[Round] = []
         self._round = 0
         self._candidates: Matrix = self.kappa[None].copy()  # κ of the round's segments, (S, 2n)
+        self._number = 0  # of the present segment in its round
+        self._segment = Segment(budget // self._shares, 2 * n)
         self._tried: Matrix = np.zeros((0, 3 + n))  # rows (round, κ, ℓ, s) of settled samples
-        self._segment = 0
-        self._begin_segment(budget // self._shares)
 
     @property
     def theta(self) -> Parameters:
@@ -155,7 +289,7 @@ class BackOffSearch:
         """θ of the present segment; the best one when the search has ended."""
         if self.has_ended:
             return self.theta
-        kappa = self._candidates[self._segment]
+        kappa = self._candidates[self._number]
         return self.backed_off(kappa)
 
     @property
@@ -188,158 +322,121 @@ class BackOffSearch:
         Returns:
             Whether it was the segment's last; `trial` is the next one's then.
         """
+        segment = self._segment
         if transition is not None:
-            row = [
-                self._count,
-                transition.stage_cost,
-                *transition.s.tolist(),
-                *transition.a.tolist(),
-                *transition.next_s.tolist(),
-            ]
-            self._rows.append(row)
+            segment.add(transition)
             # Which bounds are active is found in the first round alone.
             if self._round == 0:
                 gradient = transition.solution.value_gradient
                 multipliers = gradient[self._bounds]
-                self._n_active += multipliers != 0
-        self._count += 1
-        if self._count < self._length:
+                segment.n_active += multipliers != 0
+        segment.count += 1
+        if segment.count < segment.length:
             return False
-        self._end_segment()
+        self._end_segment(segment)
         return True
 
-    def _begin_segment(self, length: int) -> None:
-        self._length = length
-        self._count = 0
-        self._rows: list[list[float]] = []  # (number, ℓ, s, a, s₊) of samples that did not fail
-        self._n_active = np.zeros(2 * self._n)  # samples in which each bound was active
-
-    def _end_segment(self) -> None:
+    def _end_segment(self, segment: Segment) -> None:
+        """Keep what a segment has shown, and begin the next one, perhaps of another round."""
         self.led_beyond = False
-        rows = np.array(self._rows).reshape(-1, self._n_columns)
-        # A bound counts that was active at any of the first round's κ.
         if self._round == 0:
-            share = self._n_active / self._length
+            # A bound counts that was active at any of the first round's κ.
+            share = segment.n_active / segment.length
             self._active = np.maximum(self._active, share)
         if not self._schedule:
-            length = self._begin_schedule(rows)
+            self._begin_schedule(segment)
+            if self.has_ended:
+                return
+        self._keep(segment)
+        self._number += 1
+        if self._number == len(self._candidates):
+            self._end_round()
         else:
-            bound, _ = self._schedule[self._round]
-            kappa = self._candidates[self._segment, bound]
-            self._keep(rows, kappa)
-            length = self._length
-        if self.has_ended:
-            return
-        self._segment += 1
-        if self._segment == len(self._candidates):
-            length = self._end_round()
-        self._begin_segment(length)
+            self._segment = Segment(segment.length, 2 * self._n)
 
-    def _begin_schedule(self, rows: Matrix) -> int:
-        """Find σ and the first bound; the first segment counts as the first of its coarse round.
-
-        Returns:
-            Samples of the next segment.
-        """
-        if not len(rows) or self._active.max() < self.settings.active_share:
+    def _begin_schedule(self, segment: Segment) -> None:
+        """Find σ and the first bound, whose coarse round the first segment, at κ = 0, begins."""
+        if segment.is_empty or self._active.max() < self.settings.active_share:
             self.has_ended = True
-            return 0
-        n = self._n
-        m = self._n_columns - 2 - 2 * n
-        _, _, states, actions, next_states = np.split(rows, np.cumsum([1, 1, n, m]), axis=1)
-        errors = self._model.errors(states, actions, next_states, self.start)
+            return
+        errors = segment.errors(self._model, self.start)
         self._unit = errors.std(axis=0)
         first = int(np.argmax(self._active))
-        self._schedule = [[first, Phase.COARSE]]
-        self._keep(rows, 0.0)
+        self._schedule = [Round(first, Phase.COARSE)]
         # The first round is about one bound; later rounds share the samples that it leaves.
-        length, self._candidates = self._round_at(first, Phase.COARSE, 1.0)
-        return length
+        self._begin_round(1.0)
+        # Whatever the round's first κ is, the segment was run without a back-off.
+        self._candidates[0, first] = 0.0
 
-    def _keep(self, rows: Matrix, kappa: float) -> None:
-        """Keep the samples of a segment at κ once the loop has settled."""
-        number = rows[:, 0]
-        settled = rows[number >= self._settling]
+    def _keep(self, segment: Segment) -> None:
+        """Keep the samples of a segment once the loop has settled."""
+        settled = segment.settled(self._settling)
+        if not len(settled):
+            return
+        bound = self._schedule[self._round].bound
+        kappa = self._candidates[self._number, bound]
         # Round and κ stand before the sample: slopes are taken within a round.
-        label = np.full((len(settled), 2), (self._round, kappa))
-        last = 2 + self._n
-        cost_and_state = settled[:, 1:last]
-        kept = np.hstack([label, cost_and_state])
+        labels = np.tile([self._round, kappa], (len(settled), 1))
+        kept = np.hstack([labels, settled])
         self._tried = np.concatenate([self._tried, kept])
 
-    def _end_round(self) -> int:
-        """Choose the round's κ and begin the next round; samples of its segments."""
+    def _begin_round(self, factor: float) -> None:
+        """Set the κ that the present round tries, and begin its first segment.
+
+        Args:
+            factor: of the round's share of the budget.
+        """
+        bound, phase = self._schedule[self._round]
+        offsets = self._offsets(bound, phase)
+        wanted = self.kappa[bound] + np.array(offsets)
+        self._number = 0
+        self._candidates = np.tile(self.kappa, (len(offsets), 1))
+        self._candidates[:, bound] = np.maximum(wanted, self._least(bound))
+        # One sample at least counts, once the loop has settled.
+        share = self.settings.round_shares[phase]
+        parts = self._shares * len(offsets)
+        length = int(self._budget * factor * share / parts)
+        self._segment = Segment(max(length, self._settling + 1), 2 * self._n)
+
+    def _offsets(self, bound: int, phase: Phase) -> tuple[float, ...]:
+        """κ that a round tries of its bound, from the best so far on."""
+        settings = self.settings
+        if phase == Phase.FINE:
+            return settings.fine_offsets
+        if phase == Phase.MEDIUM:
+            return settings.medium_offsets
+        # Of a start that is backed off by more than κ = 1, look for less.
+        largest = settings.coarse_offsets[-1]
+        back = max(self._least(bound), -largest)
+        return (0.0, back, back / 2) if back < -1.0 else settings.coarse_offsets
+
+    def _end_round(self) -> None:
+        """Choose the round's κ, and begin the next round."""
         bound, phase = self._schedule[self._round]
         self.kappa[bound], self.led_beyond = self._best(bound, phase)
         if self._round == 0:
             self._schedule += self._later_rounds(bound)
         self._round += 1
-        self._segment = 0
         if self._round == len(self._schedule):
             self.has_ended = True
-            return 0
-        bound, phase = self._schedule[self._round]
+            return
         # The samples of the medium round count in the fine one too.
-        if phase != Phase.FINE:
+        if self._schedule[self._round].phase != Phase.FINE:
             self._tried = self._tried[:0]
         # What the first round has left, over all rounds to come.
         shares = self.settings.round_shares
         left = self._shares - shares[Phase.COARSE]
-        total = sum(shares[later] for _, later in self._schedule[1:])
-        length, self._candidates = self._round_at(bound, phase, left / total)
-        return length
+        total = sum(shares[later.phase] for later in self._schedule[1:])
+        self._begin_round(left / total)
 
-    def _later_rounds(self, first: int) -> list[list[int]]:
+    def _later_rounds(self, first: int) -> list[Round]:
         """The rounds after the coarse one of the first bound: those of the others, then its own."""
-        rounds: list[list[int]] = []
+        rounds = []
         active = self._active >= self.settings.active_share
         for bound in np.flatnonzero(active).tolist():
             if bound != first:
-                rounds += [
-                    [bound, Phase.COARSE],
-                    [bound, Phase.MEDIUM],
-                    [bound, Phase.FINE],
-                ]
-        return [*rounds, [first, Phase.MEDIUM], [first, Phase.FINE]]
-
-    def _round_at(
-        self,
-        bound: int,
-        phase: int,
-        left: float,
-    ) -> tuple[int, Matrix]:
-        """A round of a bound.
-
-        Args:
-            bound: whose κ is tried.
-            phase: Phase.COARSE, Phase.MEDIUM or Phase.FINE.
-            left: factor of the round's share of the budget.
-
-        Returns:
-            Samples of each segment, and κ of all bounds in each, (S, 2n).
-        """
-        settings = self.settings
-        rounds = (
-            settings.coarse_offsets,
-            settings.medium_offsets,
-            settings.fine_offsets,
-        )
-        offsets = rounds[phase]
-        share = settings.round_shares[phase]
-        parts = self._shares * len(offsets)
-        wanted = int(self._budget * left * share / parts)
-        # One sample at least counts, once the loop has settled.
-        length = max(wanted, self._settling + 1)
-
-        least = self._least(bound)
-        back = max(least, -offsets[-1])
-        if phase == Phase.COARSE and back < -1.0:
-            # Of a start that is backed off, look for less.
-            offsets = (0.0, back, back / 2)
-        candidates = np.tile(self.kappa, (len(offsets), 1))
-        for row, offset in zip(candidates, offsets, strict=True):
-            row[bound] = max(row[bound] + offset, least)
-        return length, candidates
+                rounds += [Round(bound, phase) for phase in Phase]
+        return [*rounds, Round(first, Phase.MEDIUM), Round(first, Phase.FINE)]
 
     def _least(self, bound: int) -> float:
         """κ of the true bound; at most 0 if the start loosens no bound."""
@@ -353,52 +450,16 @@ class BackOffSearch:
             room = self.start["x_u"][state] - self._true_upper[state]
         return float(room / self._unit[state])
 
-    def _best(self, bound: int, phase: int) -> tuple[float, bool]:
-        """κ of least estimated cost of a bound, and whether the estimate led beyond what was run.
-
-        A sample at one κ says what another one would cost: its states move with κ, their penalty
-        is known, and the rest of the cost has a slope.
-        """
-        settings = self.settings
-        n = self._n
+    def _best(self, bound: int, phase: Phase) -> tuple[float, bool]:
+        """κ of least estimated cost of a bound, and whether that led beyond what was run."""
         if not len(self._tried):  # the controller failed in all of them
             return float(self.kappa[bound]), False
-        rounds = self._tried[:, 0]
-        kappa = self._tried[:, 1]
-        costs_and_states = self._tried[:, 2:]
-        costs = costs_and_states[:, 0]
-        states = costs_and_states[:, 1:]
-        slopes = self._slopes(rounds, kappa, costs_and_states)
-        cost_slope = slopes[0]
-        state_slopes = slopes[1:]
-        # The state itself moves as its bound does.
-        state = bound % n
-        direction = 1 if bound < n else -1
-        state_slopes[state] = self._unit[state] * direction
+        settings = self.settings
         reach = settings.reach
         if phase == Phase.COARSE:
             reach = 2 * reach
-        # Costs of different κ share their mean; what differs is estimated.
-        mean = float(costs.mean())
-
-        def change(value: float) -> float:
-            # Samples far away speak for another place of the state.
-            distance = value - kappa
-            near = np.abs(distance) < reach + settings.resolution / 2
-            change_of_states = np.outer(distance[near], state_slopes)
-            moved = states[near] + change_of_states
-            penalty = known_penalty(self._penalty, moved).mean()
-            return float(cost_slope * value + penalty)
-
-        def best_of(values: Vector) -> float:
-            changes = [change(value) for value in values]
-            estimates = mean + np.array(changes)
-            least = estimates.min()
-            limit = least + settings.plateau * abs(least)
-            plateau = values[estimates <= limit]
-            smallest = np.argmin(np.abs(plateau))
-            return float(plateau[smallest])
-
+        estimate = self._estimate(bound, reach)
+        kappa = estimate.kappa
         least = self._least(bound)
         low = max(kappa.min() - reach, least)
         high = kappa.max() + reach
@@ -406,30 +467,39 @@ class BackOffSearch:
         first = np.ceil(low / settings.resolution)
         last = np.floor(high / settings.resolution)
         grid = settings.resolution * np.arange(first, last + 1)
-        best = best_of(grid)
+        best = estimate.best_of(grid, settings.plateau)
         # Beyond what was run an estimate is a guess: of these κ the best is chosen.
         falls_at_low_end = best == grid[0] and low > least
         if best == grid[-1] or falls_at_low_end:
-            return best_of(np.unique(kappa)), True
+            return estimate.best_of(np.unique(kappa), settings.plateau), True
         return best, False
 
-    @staticmethod
-    def _slopes(
-        rounds: Vector,
-        kappa: Vector,
-        values: Matrix,
-    ) -> Vector:
-        """d/dκ of the mean of each column of values (K, 1+n), (1+n,), within the rounds (K,)."""
-        above = np.zeros(values.shape[1])
-        below = 0.0
-        for number in np.unique(rounds):
-            # Least squares within the round: rounds meet different noise.
-            inside = rounds == number
-            of_round = kappa[inside]
-            centred = of_round - of_round.mean()
-            above += centred @ values[inside]
-            below += float(centred @ centred)
-        return np.asarray(above / below if below > 0 else above)
+    def _estimate(self, bound: int, reach: float) -> CostEstimate:
+        """What the samples say of the cost at other κ of a bound.
+
+        Args:
+            bound: whose κ were tried.
+            reach: how far, in κ, a sample speaks for another κ.
+        """
+        rounds = self._tried[:, 0]
+        kappa = self._tried[:, 1]
+        costs_and_states = self._tried[:, 2:]
+        slopes = slopes_within_rounds(rounds, kappa, costs_and_states)
+        state_slopes = slopes[1:]
+        # The state itself moves as its bound does.
+        state = bound % self._n
+        direction = 1 if bound < self._n else -1
+        state_slopes[state] = self._unit[state] * direction
+        return CostEstimate(
+            kappa=kappa,
+            states=costs_and_states[:, 1:],
+            mean_cost=float(costs_and_states[:, 0].mean()),
+            cost_slope=slopes[0],
+            state_slopes=state_slopes,
+            penalty=self._penalty,
+            # κ are multiples of the resolution: half of it decides no rounding.
+            reach=reach + self.settings.resolution / 2,
+        )
 
     def state_dict(self) -> State:
         """The schedule, the open round and segment, and the best back-offs."""
@@ -441,12 +511,9 @@ class BackOffSearch:
             "schedule": np.array(self._schedule, int),
             "round": self._round,
             "candidates": self._candidates,
+            "number": self._number,
             "tried": self._tried,
-            "segment": self._segment,
-            "length": self._length,
-            "count": self._count,
-            "rows": np.array(self._rows),
-            "n_active": self._n_active,
+            **prefixed("segment", self._segment.state_dict()),
         }
 
     def load_state_dict(self, state: State) -> None:
@@ -455,15 +522,42 @@ class BackOffSearch:
         self.has_ended = state["has_ended"]
         self._unit = state["unit"]
         self._active = state["active"]
-        self._schedule = state["schedule"].tolist()
+        self._schedule = []
+        for bound, phase in state["schedule"].tolist():
+            self._schedule.append(Round(bound, Phase(phase)))
         self._round = state["round"]
         self._candidates = state["candidates"]
+        self._number = state["number"]
         self._tried = state["tried"]
-        self._segment = state["segment"]
-        self._length = state["length"]
-        self._count = state["count"]
-        self._rows = state["rows"].tolist()
-        self._n_active = state["n_active"]
+        self._segment.load_state_dict(part_of(state, "segment"))
+
+
+def slopes_within_rounds(
+    rounds: Vector,
+    kappa: Vector,
+    values: Matrix,
+) -> Vector:
+    """Slopes d/dκ of the means of values, by least squares within the rounds.
+
+    Rounds meet different noise, so that their means say nothing of κ.
+
+    Args:
+        rounds: number of each sample's round, (K,).
+        kappa: its κ, (K,).
+        values: whose means are compared, (K, M).
+
+    Returns:
+        The slopes, (M,); zero where κ is the same throughout.
+    """
+    above = np.zeros(values.shape[1])
+    below = 0.0
+    for number in np.unique(rounds):
+        inside = rounds == number
+        of_round = kappa[inside]
+        centred = of_round - of_round.mean()
+        above += centred @ values[inside]
+        below += float(centred @ centred)
+    return np.asarray(above / below if below > 0 else above)
 
 
 class BackOff(Algorithm):

@@ -12,7 +12,7 @@ from controllers.problem import Problem, load_model, multipliers
 from controllers.theta import ThetaBlocks
 from cosim.core.scenario import Scenario
 from tests.helpers import linear_plant
-from tests.helpers.other_units import ACTION, COST, STATE, factors, problems
+from tests.helpers.other_zeros import COUNTINGS
 from tests.helpers.sampling import evaporator_problem
 
 BAD = {
@@ -66,21 +66,25 @@ def test_the_largest_multiplier_is_the_optimal_steady_states(problem):
     assert problem.units.largest_multiplier == pytest.approx(by_ipopt.max())
 
 
-def test_other_decimal_units_change_the_units_alone():
-    own, other = (problem.units for problem in problems(Scenario.load("paper")))
-    assert other.state == pytest.approx(STATE * own.state, rel=1e-14)
-    assert other.action == pytest.approx(ACTION * own.action, rel=1e-14)
-    assert other.cost == pytest.approx(COST * own.cost, rel=1e-14)
+def test_other_decimal_units_and_zeros_change_the_units_alone():
+    counting = COUNTINGS["paper"]
+    state, action = np.array(counting.states[0]), np.array(counting.actions[0])
+    own, other = (problem.units for problem in counting.problems(Scenario.load("paper")))
+    assert other.state == pytest.approx(state * own.state, rel=1e-14)
+    assert other.action == pytest.approx(action * own.action, rel=1e-14)
+    assert other.cost == pytest.approx(counting.cost * own.cost, rel=1e-14)
     assert other.exact_penalty_weights() == pytest.approx(
-        COST / STATE * own.exact_penalty_weights(), rel=1e-14
+        counting.cost / state * own.exact_penalty_weights(), rel=1e-14
     )
 
 
 def test_the_scale_of_theta_is_recounted_with_the_problem():
+    counting = COUNTINGS["paper"]
     own, other = (
-        ThetaBlocks.from_problem(p, slack_weights=True) for p in problems(Scenario.load("paper"))
+        ThetaBlocks.from_problem(problem, slack_weights=True)
+        for problem in counting.problems(Scenario.load("paper"))
     )
-    assert other.scale == pytest.approx(factors(own) * own.scale, rel=1e-13)
+    assert other.scale == pytest.approx(counting.factors(own) * own.scale, rel=1e-13)
 
 
 def test_a_constant_in_the_cost_changes_nothing(problem):

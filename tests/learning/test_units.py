@@ -17,6 +17,10 @@ from learning.training_run import starting_parameters
 from tests.helpers.other_zeros import COUNTINGS, NoisyModel
 from tests.helpers.training import looped
 
+IN_PLANT_UNITS = pytest.mark.xfail(
+    reason="the economic tuning asks for the best-conditioned Hessian in the plant's units",
+    strict=True,
+)
 SAMPLES = 160
 SETTINGS = {
     QLearning: {"prior_samples": 100, "step_every": 20, "explained_noise": 100},
@@ -80,8 +84,8 @@ def test_a_rule_learns_the_same_policy_in_other_units_from_other_zeros(scenario,
         pytest.param("paper", marks=pytest.mark.slow),
         "reactor",
         pytest.param("tanks", marks=pytest.mark.slow),
-        pytest.param("dead-time", marks=pytest.mark.slow),
-        pytest.param("unstable-reactor", marks=pytest.mark.slow),
+        pytest.param("dead-time", marks=[pytest.mark.slow, IN_PLANT_UNITS]),
+        pytest.param("unstable-reactor", marks=[pytest.mark.slow, IN_PLANT_UNITS]),
     ],
 )
 @pytest.mark.filterwarnings("ignore::controllers.errors.TuningWarning")

@@ -39,14 +39,14 @@ schema = 1
 name = "runs"
 scenarios = ["paper"]
 training_seeds = { first = 0, count = 2 }
-evaluation = { seeds = 4, steps = 500 }
+evaluation = { seeds = 4, steps = 100 }
 curves = { points = 2, seeds = 1, steps = 100 }
 [[case]]
 controller = "tuned"
 [[case]]
 name = "q"
 algorithm = "q-learning"
-samples = 3000
+samples = 1000
 """
 WAYS = ("kill the group", "kill the parent", "SIGTERM", "Ctrl-C")
 

@@ -89,7 +89,7 @@ NOT_RUN = {"scipy", "matplotlib"}
     [
         ("'--help'", HEAVY),
         ("'simulate','-n','1','-o'", NOT_RUN | {"pandas", "rerun"}),
-        ("'simulate','--record','-n','1','-o'", NOT_RUN),
+        pytest.param("'simulate','--record','-n','1','-o'", NOT_RUN, marks=pytest.mark.slow),
     ],
 )
 def test_a_command_loads_no_library_that_it_does_not_need(tmp_path, words, heavy):

@@ -81,6 +81,7 @@ def test_a_controller_without_a_name_is_evaluated_as_it_is(kind, tmp_path):
     assert second == costs(kind(3.0)) != first
 
 
+@pytest.mark.slow
 def test_an_edited_plug_in_is_loaded_anew_in_one_process_and_in_many(plug):
     name, path, edit = plug
     before = costs(name)

@@ -50,9 +50,16 @@ def refused(result):
 # Kills -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+# A study trains, evaluates, starts workers and goes on from checkpoints: the others do less.
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-@pytest.mark.parametrize("job", ["training", "study", "recording"])
+@pytest.mark.parametrize(
+    "job",
+    [
+        pytest.param("study", marks=pytest.mark.slow),
+        pytest.param("training", marks=pytest.mark.campaign),
+        pytest.param("recording", marks=pytest.mark.campaign),
+    ],
+)
 def test_a_signal_loses_nothing_and_leaves_nothing(job):
     campaign(1, seed=os.getpid(), names=(job,))
 

@@ -1,12 +1,15 @@
-"""The command line in a process of its own; waiting for what it does, and for its end."""
+"""The command line, here or in a process of its own; waiting for what it does, and for its end."""
 
+import io
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import psutil
 
@@ -42,6 +45,20 @@ def run_cosim(
         check=check,
         **options,
     )
+
+
+def run_here(*words: object) -> subprocess.CompletedProcess[str]:
+    """Run `cosim` in this process, which has loaded its packages already."""
+    from cosim.cli import main
+
+    arguments = ["cosim", *map(str, words)]
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with redirect_stdout(out), redirect_stderr(err), mock.patch.object(sys, "argv", arguments):
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
 
 
 def start_cosim(

@@ -60,7 +60,7 @@ class PlainEstimate:
 
 def test_the_estimate_is_that_of_plain_generalised_least_squares(features, rng):
     error = rng.normal(scale=0.05, size=features.n_parameters)
-    inputs, outputs = plant_data(features, rng, 200, error)
+    inputs, outputs = plant_data(features, rng, 120, error)
     outputs[:, 0] += 0.02 * (inputs[:, 0] - 27.0)
     model = fit(features, inputs, outputs)
     plain = max(

@@ -40,6 +40,7 @@ def test_exact_outputs_do_not_drown_what_noisy_ones_say(rng):
     assert np.abs((model.predict(inputs)[0] - y).mean(axis=0)).max() < 0.05
 
 
+@pytest.mark.slow
 def test_the_deviation_of_the_mean_cost_is_what_the_fits_scatter(features, rng):
     at = plant_data(features, rng, 50, np.zeros(features.n_parameters))[0]
     costs, deviations = [], []

@@ -7,6 +7,7 @@ from learning.plant_data import PlantData
 from tests.helpers.empirical import SETTINGS, plant_data
 
 
+@pytest.mark.slow
 def test_data_from_before_a_slow_change_are_dropped(features, rng):
     error, parts = np.zeros(features.n_parameters), []
     for _ in range(4):

@@ -8,9 +8,11 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import fmus
 
@@ -71,11 +73,43 @@ def wheel(sdist, python):
     return path
 
 
+def dependencies(wheel: Path) -> list[Distribution]:
+    """What a wheel asks for, without its extras, and what that asks for in turn, as it is here."""
+    needed: dict[str, Distribution] = {}
+
+    def follow(lines: list[str], extras: set[str]) -> None:
+        for requirement in map(Requirement, lines):
+            marker = requirement.marker
+            environments = [{"extra": extra} for extra in extras or {""}]
+            if marker is not None and not any(map(marker.evaluate, environments)):
+                continue
+            there = distribution(requirement.name)
+            if there.name not in needed:
+                assert there.version in requirement.specifier
+                needed[there.name] = there
+                follow(there.requires or [], requirement.extras)
+
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+        lines = archive.read(name).decode().partition("\n\n")[0].splitlines()
+    prefix = "Requires-Dist: "
+    follow([line.removeprefix(prefix) for line in lines if line.startswith(prefix)], set())
+    return list(needed.values())
+
+
 @pytest.fixture(scope="module")
 def installed(wheel, python):
-    """Interpreter with the wheel and what it depends on, at the versions of the lock."""
-    lock = ROOT / "constraints.txt"
-    run(python, "-m", "pip", "install", "--quiet", "-c", lock, wheel, cwd=wheel.parent)
+    """Interpreter with the wheel and what it says that it depends on, and nothing else.
+
+    The dependencies are links to those that the tests run with, which pip put there by the lock.
+    """
+    run(python, "-m", "pip", "install", "--quiet", "--no-deps", wheel, cwd=wheel.parent)
+    code = "import sysconfig; print(sysconfig.get_path('platlib'))"
+    packages = Path(run(python, "-c", code, cwd=wheel.parent).strip())
+    for dependency in dependencies(wheel):
+        for entry in {file.parts[0] for file in dependency.files} - {"..", "__pycache__"}:
+            if not (packages / entry).exists():
+                (packages / entry).symlink_to(dependency.locate_file(entry))
     return python
 
 

@@ -10,6 +10,7 @@ from tests.helpers.linear_plant import LinearPlant
 PHI = 0.7
 
 
+@pytest.mark.slow
 def test_the_mean_cost_is_riccatis() -> None:
     """x₊ = Ax + Bu + E d with d = σ ξ₊, ξ₊ = φ ξ + √(1 − φ²) w: the state is (x, ξ)."""
     sigma = 0.1

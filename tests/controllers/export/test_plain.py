@@ -15,7 +15,7 @@ from controllers.errors import ControllerError
 from controllers.export import core, plain_c
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario, simulate
-from tests.helpers.command import run_cosim
+from tests.helpers.command import run_here
 from tests.helpers.compiler import needs_compiler
 
 CC = os.environ.get("CC", "cc")
@@ -41,7 +41,7 @@ def rows(program, states):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plain") / "evaporator_nmpc"
-    run_cosim("export", "tuned", "--format", "c", "--out", folder, "--json", check=True)
+    run_here("export", "tuned", "--format", "c", "--out", folder, "--json").check_returncode()
     return folder
 
 
@@ -114,7 +114,8 @@ def test_it_calls_no_more_than_it_says(exported):
 @pytest.mark.slow
 def test_in_single_precision_a_loop_has_its_actions_and_a_wild_state_is_held(tmp_path, example):
     folder = tmp_path / "single_nmpc"
-    run_cosim("export", "tuned", "--format", "c", "--single", "--out", folder, check=True)
+    words = ("export", "tuned", "--format", "c", "--single", "--out", folder)
+    run_here(*words).check_returncode()
     command = [CC, *FLAGS, "-O0", "-Wdouble-promotion", "-c", "single_nmpc.c", "-o", "object.o"]
     subprocess.run(command, cwd=folder, check=True)
     program = built(folder)
@@ -126,7 +127,7 @@ def test_in_single_precision_a_loop_has_its_actions_and_a_wild_state_is_held(tmp
     held = rows(program, [(25.0, 50.0), (1e30, 1e30)])
     assert held[1, 2] != 0
     np.testing.assert_array_equal(held[1, :2], held[0, :2])
-    failed = run_cosim("export", "tuned", "--single", "--out", tmp_path / "c.fmu")
+    failed = run_here("export", "tuned", "--single", "--out", tmp_path / "c.fmu")
     assert (failed.returncode, "--single goes with --format c" in failed.stderr) == (2, True)
 
 

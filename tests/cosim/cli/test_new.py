@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.code_blocks import ROOT
+from tests.helpers.code_blocks import ROOT, with_less
 
 PAGES = {
     "rule": ("capped_td", "algorithm.md"),
@@ -37,6 +37,8 @@ def test_a_skeleton_is_what_its_page_shows_and_is_written_once(kind, cosim, tmp_
 @pytest.mark.parametrize("kind", PAGES)
 def test_a_skeleton_runs_by_the_commands_that_are_printed(kind, cosim, tmp_path):
     said = cosim("new", kind, "my_own", "--out", "a folder")[2]
+    for file in (tmp_path / "a folder").iterdir():
+        file.write_text(with_less(file.read_text("utf-8")), "utf-8")
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     script = "set -e\n" + said.partition("next:\n")[2]
     env = os.environ | {"PATH": path}

@@ -58,9 +58,14 @@ def test_without_a_compiler_there_is_none_and_the_description_says_so(folder, mo
     assert "no C compiler" in description()
 
 
+@pytest.fixture(scope="module")
+def presets_sources():
+    return preset_sources()
+
+
 @pytest.mark.slow
-def test_the_stored_builds_are_those_of_the_presets():
-    names = {build_name(each, system) for each in preset_sources() for system in SYSTEMS.values()}
+def test_the_stored_builds_are_those_of_the_presets(presets_sources):
+    names = {build_name(each, system) for each in presets_sources for system in SYSTEMS.values()}
     with tarfile.open(BUILDS) as builds:
         assert set(builds.getnames()) == names, "python -m benchmarks.builds"
         for build in (builds.extractfile(name).read() for name in names):
@@ -68,10 +73,10 @@ def test_the_stored_builds_are_those_of_the_presets():
 
 
 @pytest.mark.slow
-def test_a_stored_build_is_what_its_sources_give():
+def test_a_stored_build_is_what_its_sources_give(presets_sources):
     pytest.importorskip("ziglang")
     with tarfile.open(BUILDS) as builds:
-        for sources in preset_sources()[:2]:
+        for sources in presets_sources[:2]:
             name = build_name(sources, SYSTEMS[present().tuple])
             assert builds.extractfile(name).read() == built(sources, present())
 

@@ -25,7 +25,7 @@ BLOCKS = {
 }
 HESSIANS = ("gauss-newton", "exact")
 WHOLE = {"all": slice(None)}
-FEW, MANY = 2, 20
+FEW, MANY = 2, 12
 KINDS = [(blocks, hessian) for blocks in BLOCKS for hessian in HESSIANS]
 
 
@@ -90,15 +90,19 @@ def check_derivatives(blocks, hessian, numbers):
 
 
 # `physical` has every block that `extended` has.
-@pytest.mark.parametrize(("blocks", "hessian"), [kind for kind in KINDS if kind[0] != "extended"])
+DIFFERENTIATED = [kind for kind in KINDS if kind[0] != "extended"]
+
+
+@pytest.mark.parametrize(("blocks", "hessian"), DIFFERENTIATED)
 def test_every_derivative_equals_finite_differences(blocks, hessian):
     check_derivatives(blocks, hessian, range(FEW))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("blocks", "hessian"), KINDS)
+@pytest.mark.parametrize(("blocks", "hessian"), DIFFERENTIATED)
 def test_every_derivative_equals_finite_differences_at_many_points(blocks, hessian):
-    check_derivatives(blocks, hessian, range(FEW * (blocks != "extended"), MANY))
+    # One in three has inputs that saturate.
+    check_derivatives(blocks, hessian, range(FEW, MANY))
 
 
 # V, Q and π from one linearisation point ------------------------------------------------------

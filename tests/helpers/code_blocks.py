@@ -25,6 +25,7 @@ TITLE = re.compile(r'title="([^"]+)"')
 COVERED = {
     "make demo": "the Makefile's target; `make check` runs its command on a small budget",
     "cosim demo --out demo": "minutes; `make check` runs it on a small budget",
+    "cosim demo --samples 4000 --steps 100 --out first-look": "tests/cosim/test_cli.py",
     "make test": "the target is run by .ci/run",
     "python3 -m venv .venv": "tests/packaging installs into an empty environment",
     ". .venv/bin/activate": "tests/packaging installs into an empty environment",
@@ -57,12 +58,18 @@ SMALLER = {
     "naive,backed-off,learnt": "naive,learnt",
     "--seeds 20 --steps 1000": "--seeds 2 --steps 100",
     "--seeds 3 --steps 1000": "--seeds 2 --steps 200",
-    "--samples 4000 --steps 100": "--samples 1000 --steps 20",
+    "--seeds 4 --steps 500": "--seeds 2 --steps 300",
+    "500 samples × 4 seeds": "300 samples × 2 seeds",
     "--samples 40000": "--samples 2000",
     "--samples 20000": "--samples 4000",
     "20000 samples": "4000 samples",
     "--samples 10000": "--samples 4000",
     "--samples 1440": "--samples 120 --set coarse_rollout=600 --set fine_rollout=900",
+    "--start cautious --out learned\n": (
+        "--start cautious --out learned --set coarse_rollout=600 --set fine_rollout=900\n"
+    ),
+    '"fouled", 10_000, seed=0': '"fouled", 4000, seed=0',
+    '"fouled", 2000, start=': '"fouled", 1000, start=',
     "samples=4000, seed=0, evaluate_every=1000": "samples=1000, seed=0, evaluate_every=500",
     "\nsamples = 1000\n": "\nsamples = 200\n",
     "training_seeds = { first = 0, count = 2 }": "training_seeds = { first = 0, count = 1 }",

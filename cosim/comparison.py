@@ -26,7 +26,7 @@ def load_run(path: str | Path) -> RunSignals:
     """Load a run.
 
     Args:
-        path: a folder that holds trajectory.csv, such a CSV, or a `.rrd` file.
+        path: a folder that holds trajectory.csv or trajectory.parquet, such a file, or a `.rrd`.
 
     Raises:
         ComparisonError: there is no run.
@@ -35,9 +35,13 @@ def load_run(path: str | Path) -> RunSignals:
     """
     path = Path(path)
     if path.is_dir():
-        path = path / "trajectory.csv"
+        # A long run is written by columns.
+        by_columns = path / "trajectory.parquet"
+        path = by_columns if by_columns.is_file() else path / "trajectory.csv"
     if not path.is_file():
-        raise ComparisonError(f"there is no run at '{path}'; give a run's folder, CSV or .rrd")
+        raise ComparisonError(
+            f"there is no run at '{path}'; give a run's folder, CSV, Parquet or .rrd"
+        )
     if path.suffix == ".rrd":
         return _load_recording(path)
     bounds: Mapping[str, tuple[float, float]] = {}

@@ -11,9 +11,12 @@ import cosim
 from cosim.cli import output as cli
 
 SIMULATION_FILES = (
-    "trajectory.csv", "trajectory.png", "timing.csv", "summary.json", "scenario.toml", "run.rrd",
+    "trajectory.csv", "trajectory.parquet", "trajectory.png", "timing.csv", "timing.parquet",
+    "summary.json", "scenario.toml", "run.rrd",
 )  # fmt: skip
 """Files of a run; all in a folder belong to one."""
+LONG_TABLE = 100_000
+"""Samples of the longest run that is written as text: that takes as long as the run."""
 
 
 def simulate(
@@ -22,13 +25,15 @@ def simulate(
     steps: cli.StepsOption = 1000,
     seed: cli.SeedOption = 0,
     out: cli.OutOption = Path("cosim-run"),
+    plot: Annotated[bool, typer.Option("--plot")] = False,
     record: cli.RecordOption = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Run a controller on a scenario's plant.
 
-    Writes trajectory.csv, trajectory.png (of 2 to 20 000 samples), timing.csv,
-    summary.json, scenario.toml and, with --record, run.rrd.
+    Writes trajectory.csv, timing.csv, summary.json, scenario.toml, with --plot trajectory.png and
+    with --record run.rrd. Of more than 100 000 samples trajectory.parquet and timing.parquet are
+    written in place of the CSV files: the same columns, which pandas.read_parquet reads.
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
 
@@ -38,16 +43,20 @@ def simulate(
     Args:
         controller: naive, tuned, backed-off, cautious, lqr, pi, converged, optimal, a parameters
             file, or module:factory.
+        plot: Draw trajectory.png too, of 2 to 20 000 samples; it takes a second.
     """
     with cli.output(json) as out_:
-        from cosim.core.errors import PlantError
+        from cosim.core.errors import CosimError, PlantError
         from cosim.core.files import staged
 
+        # Before the run, which may take long.
+        if plot and not 1 < steps <= cli.MOST_DRAWN:
+            raise CosimError(f"--plot draws 2 to {cli.MOST_DRAWN} samples, not {steps}")
         loaded = cosim.Scenario.load(scenario)
         folder = cli.open_folder(out)
         out_.announce(loaded.plant.fmu)
         with staged(folder, SIMULATION_FILES) as stage:
-            summary = _simulate(loaded, controller, steps, seed, stage, record, out_.live)
+            summary = _simulate(loaded, controller, steps, seed, stage, plot, record, out_.live)
             cli.write_summary(stage, summary)
         rows = [
             ("economic cost", f"{summary['economic_cost']:.3f}"),
@@ -79,6 +88,7 @@ def _simulate(
     steps: int,
     seed: int,
     folder: Path,
+    plot: bool,
     record: bool,
     progress: bool,
 ) -> dict[str, Any]:
@@ -125,10 +135,14 @@ def _simulate(
         }
     if ended:
         summary["ended"] = ended
-    run.write_csv(folder / "trajectory.csv")
-    run.write_timing_csv(folder / "timing.csv")
-    # One sample makes no line.
-    if 1 < len(run) <= cli.MOST_DRAWN:
+    if len(run) > LONG_TABLE:
+        run.write_parquet(folder / "trajectory.parquet")
+        run.write_timing_parquet(folder / "timing.parquet")
+    else:
+        run.write_csv(folder / "trajectory.csv")
+        run.write_timing_csv(folder / "timing.csv")
+    # A run that ended early may be one sample, which makes no line.
+    if plot and len(run) > 1:
         run.plot(folder / "trajectory.png")
     (folder / "scenario.toml").write_text(scenario.to_toml(), "utf-8")
     return summary

@@ -57,6 +57,26 @@ def test_the_same_command_and_seed_write_the_same_bytes(cosim, tmp_path):
     assert one == two
 
 
+def test_a_long_run_is_written_by_columns_and_drawn_when_asked_for(cosim, tmp_path, monkeypatch):
+    assert cosim("simulate", "--steps", 20, "--out", "short")[0] == 0
+    monkeypatch.setattr("cosim.cli.simulate.LONG_TABLE", 19)
+    assert cosim("simulate", "--steps", 20, "--out", "long")[0] == 0
+    beside = {"scenario.toml", "summary.json"}
+    written = {path.name for path in (tmp_path / "short").iterdir()}
+    assert written == beside | {"trajectory.csv", "timing.csv"}
+    written = {path.name for path in (tmp_path / "long").iterdir()}
+    assert written == beside | {"trajectory.parquet", "timing.parquet"}
+    assert cosim("compare", "short", "long")[0] == 0
+    code, _, err = cosim("simulate", "--steps", 20_001, "--plot", "--out", "long")
+    assert code == 2 and "--plot draws 2 to 20000 samples" in err
+
+
+@pytest.mark.slow
+def test_a_picture_is_drawn_when_asked_for(cosim, tmp_path):
+    assert cosim("simulate", "--steps", 20, "--plot", "--out", "drawn")[0] == 0
+    assert (tmp_path / "drawn" / "trajectory.png").stat().st_size > 10_000
+
+
 @pytest.mark.slow
 def test_a_foreign_fmu_is_announced_with_its_hash(cosim, tmp_path):
     import hashlib

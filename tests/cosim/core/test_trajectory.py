@@ -1,10 +1,11 @@
 import numpy as np
+import pandas as pd
 import pytest
 
 from cosim import FmuPlant, simulate
 from cosim.comparison import compare, load_run
 from cosim.core.errors import TrajectoryError
-from cosim.core.trajectory import SIGNALS, SignalKind, read_csv
+from cosim.core.trajectory import SIGNALS, SignalKind, read_csv, read_signals
 from cosim.recording import RerunRecorder, read_recording
 from tests.helpers.loop import Proportional
 
@@ -24,6 +25,22 @@ def test_csv_reads_back_to_the_same_bits(trajectory, tmp_path):
         assert copy.signals[name].unit == signal.unit
     assert list(copy.status) == list(trajectory.status)
     assert copy.to_csv() == trajectory.to_csv()
+
+
+def test_parquet_has_the_columns_of_the_csv_for_every_reader(trajectory, tmp_path):
+    trajectory.write_csv(tmp_path / "t.csv")
+    trajectory.write_parquet(tmp_path / "t.parquet")
+    by_columns = pd.read_parquet(tmp_path / "t.parquet")
+    as_text = pd.read_csv(tmp_path / "t.csv", float_precision="round_trip")
+    pd.testing.assert_frame_equal(by_columns, as_text, check_dtype=False, check_exact=True)
+    signals, status = read_signals(tmp_path / "t.parquet")
+    assert status == list(trajectory.status)
+    for name, signal in trajectory.signals.items():
+        assert signals[name].unit == signal.unit
+        assert signals[name].values.tobytes() == signal.values.tobytes()
+    (tmp_path / "t.parquet").write_bytes(b"PAR1 cut")
+    with pytest.raises(TrajectoryError, match="t.parquet' cannot be read"):
+        read_signals(tmp_path / "t.parquet")
 
 
 def test_clock_readings_are_only_in_the_timing(trajectory, tmp_path):

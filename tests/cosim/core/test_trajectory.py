@@ -1,6 +1,8 @@
+import csv
+
 import numpy as np
-import pandas as pd
 import pytest
+from pyarrow import parquet
 
 from cosim import FmuPlant, simulate
 from cosim.comparison import compare, load_run
@@ -30,16 +32,19 @@ def test_csv_reads_back_to_the_same_bits(trajectory, tmp_path):
 def test_parquet_has_the_columns_of_the_csv_for_every_reader(trajectory, tmp_path):
     trajectory.write_csv(tmp_path / "t.csv")
     trajectory.write_parquet(tmp_path / "t.parquet")
-    by_columns = pd.read_parquet(tmp_path / "t.parquet")
-    as_text = pd.read_csv(tmp_path / "t.csv", float_precision="round_trip")
-    pd.testing.assert_frame_equal(by_columns, as_text, check_dtype=False, check_exact=True)
+    table = parquet.read_table(tmp_path / "t.parquet")
+    with (tmp_path / "t.csv").open(newline="") as stream:
+        header, *rows = csv.reader(stream)
+    assert table.column_names == header
+    cells = [list(column) for column in zip(*rows, strict=True)]
+    assert [[str(cell.as_py()) for cell in column] for column in table.columns] == cells
     signals, status = read_signals(tmp_path / "t.parquet")
     assert status == list(trajectory.status)
     for name, signal in trajectory.signals.items():
         assert signals[name].unit == signal.unit
         assert signals[name].values.tobytes() == signal.values.tobytes()
     (tmp_path / "t.parquet").write_bytes(b"PAR1 cut")
-    with pytest.raises(TrajectoryError, match="t.parquet' cannot be read"):
+    with pytest.raises(TrajectoryError, match=r"t\.parquet' cannot be read"):
         read_signals(tmp_path / "t.parquet")
 
 

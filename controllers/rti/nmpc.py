@@ -465,10 +465,10 @@ def growth_over_horizon(problem: Problem) -> float:
     return float(radius**problem.horizon)
 
 
-CROSSING = 15
-"""Stages from which a sweep by stages is faster, where there are no more states than actions."""
-CONDENSING_LIMIT = 400_000
-"""Bytes of the stack that the engine's condensing may take: a thread may have no more than 512 kB.
+CROSSING = 30
+"""Stages from which a sweep by stages is faster, with one action and no more states."""
+CONDENSING_LIMIT = 800_000
+"""Bytes of the stack that the engine's condensing may take: a thread of Python's has a megabyte.
 
 The QP itself and the solver's work are in the engine's arrays, not on the stack.
 """
@@ -478,9 +478,9 @@ def solves_by_stage(problem: Problem) -> bool:
     """Whether a compiled engine solves the QP stage by stage and does not condense it.
 
     Condensing and the factor take (N m)³ operations, a sweep by stages N n³: they cross at an N
-    that grows as (n/m)^1.5. Where that is was measured on tanks in series, one level at its bound
-    (`python -m benchmarks.paths`, benchmarks/performance.md). Where the model is unstable the
-    condensed QP would lose its digits.
+    that grows as (n/m)^1.5, and falls with m as the solver by stages then takes fewer sweeps. Where
+    that is was measured on tanks in series, one level at its bound (`python -m benchmarks.paths`,
+    benchmarks/performance.md). Where the model is unstable the condensed QP would lose its digits.
 
     Args:
         problem: The control problem, whose QP has N stages of n states and m actions.
@@ -488,7 +488,8 @@ def solves_by_stage(problem: Problem) -> bool:
     n = problem.n_states
     m = problem.n_actions
     horizon = problem.horizon
-    long = horizon >= CROSSING * max(1.0, n / m) ** 1.5
+    crossing = CROSSING * max(1.0, n / m) ** 1.5 / m ** (2 / 3)
+    long = horizon >= crossing
     # Responses of each stage's state to all controls, and the factor of the condensed Hessian.
     controls = horizon * m
     responses = (horizon + 1) * n * (controls + n + 1)

@@ -64,11 +64,14 @@ condensed_alone = pytest.mark.parametrize("compiled", ["condensed"], indirect=Tr
 
 @condensed_alone
 @pytest.mark.parametrize(
-    ("n", "horizon", "by_stage"),
-    [(2, 10, False), (2, 20, True), (4, 40, False), (4, 60, True), (16, 10, False), (16, 40, True)],
-)
-def test_the_path_is_chosen_by_cost_and_not_by_the_export(n, horizon, by_stage):
-    assert nmpc.solves_by_stage(tanks_in_series(n, horizon)) is by_stage
+    ("n", "m", "horizon", "by_stage"),
+    [
+        (2, 2, 10, False), (2, 2, 20, True), (2, 1, 80, False), (4, 2, 40, False), (4, 2, 60, True),
+        (8, 4, 20, False), (8, 4, 40, True), (16, 2, 10, False), (16, 2, 40, False),
+    ],
+)  # fmt: skip
+def test_the_path_is_chosen_by_measured_cost_and_not_by_the_export(n, m, horizon, by_stage):
+    assert nmpc.solves_by_stage(tanks_in_series(n, horizon, m)) is by_stage
 
 
 @condensed_alone

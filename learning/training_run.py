@@ -29,6 +29,7 @@ from cosim.core.training_options import (
     HELD_OUT,
     LOG_EVERY,
     MOST,
+    SLOW_LOG_EVERY,
     Range,
     TrainingOptions,
     option_ranges,
@@ -64,9 +65,6 @@ HELD_OUT_SHARE = 10
 """Training samples per held-out sample, at least, on a plant that may be slow."""
 SHORTEST = 10
 """Samples of a held-out run that says something, at least."""
-SLOW_LOG_EVERY = 100
-"""Samples a row of the log and a checkpoint, where nothing else is asked for, on a plant that may
-be slow: what a stop loses is a minute at most where a step takes half a second."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,10 @@ EVALUATE_EVERY = 5000
 """Samples per greedy evaluation and per checkpoint, about, likewise."""
 EVALUATION_STEPS = 500
 """Samples of a held-out run, where nothing else is asked for and the plant is known to be fast."""
+SLOW_LOG_EVERY = 100
+"""Samples a row of the log and a checkpoint, likewise, on a plant that may be slow: what a stop
+loses is a minute at most where a step takes half a second.
+"""
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 MOST = 100_000_000

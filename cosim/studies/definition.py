@@ -12,10 +12,11 @@ from controllers.optimum import stored_optimum
 from cosim.core.errors import StudyError
 from cosim.core.modules import import_from
 from cosim.core.scenario import Scenario, resolved
-from cosim.core.training_options import HELD_OUT, OPTION_NAMES, TrainingOptions
+from cosim.core.training_options import HELD_OUT, OPTION_NAMES, SLOW_LOG_EVERY, TrainingOptions
 from cosim.core.validation import instead, validated
 from cosim.evaluation import NAIVE
 from cosim.measurement import Noise
+from cosim.plant.fmi import SHIPPED_FMUS
 from cosim.studies.document import DEFAULT, CaseTable, SeedsTable, StudyTable, read
 from cosim.studies.grid import GridPoint, grid_points
 from cosim.studies.run import TrainingJob
@@ -325,6 +326,19 @@ class Study:
         """Whether greedy evaluations have noise of their own, that of `[curves]`."""
         return self.table.operation is None or "curves" in self.table.model_fields_set
 
+    def is_fast(self, scenario: str) -> bool:
+        """Whether a scenario's plant is known to be fast; a step of another's FMU may take long."""
+        return self.scenarios[scenario].plant.fmu in SHIPPED_FMUS
+
+    def draws_curves(self, scenario: str) -> bool:
+        """Whether all trainings on a scenario have the greedy evaluations of `[curves]`.
+
+        On a plant that may be slow they have them only where the study asks for them.
+        """
+        return self.has_curves and (
+            "curves" in self.table.model_fields_set or self.is_fast(scenario)
+        )
+
     def noise_at_marks(self, scenario: str) -> Noise:
         """Noise on which θ is evaluated at the times of operation."""
         evaluation = self.noise(scenario)
@@ -434,8 +448,21 @@ class Study:
         # Rows of the log up to a greedy evaluation, evenly.
         n_rows = -(-between_points // MOST_BETWEEN_ROWS)
         log_every = max(1, between_points // n_rows)
+        between_checkpoints = BETWEEN_CHECKPOINTS
+        # Each step of another's FMU may take its time: what a stop loses is little.
+        if not self.is_fast(scenario):
+            log_every = min(log_every, SLOW_LOG_EVERY)
+            n_rows = max(1, between_points // log_every)
+            between_checkpoints = SLOW_LOG_EVERY
         # A checkpoint is taken at a row of the log.
-        rows_between_checkpoints = max(1, round(BETWEEN_CHECKPOINTS / log_every))
+        rows_between_checkpoints = max(1, round(between_checkpoints / log_every))
+        # Held-out runs are then a share of the training's samples, unless the study says more.
+        if self.has_curves and not self.draws_curves(scenario):
+            return {
+                "log_every": log_every,
+                "evaluate_every": log_every * max(1, samples // log_every),
+                "checkpoint_every": log_every * rows_between_checkpoints,
+            }
         return {
             "log_every": log_every,
             "evaluate_every": log_every * n_rows,

@@ -189,7 +189,7 @@ class _CaseOnScenario:
         noise = {EVALUATION: study.noise(self.name)}
         cases_here = [case for case in study.cases if self.name in case.scenarios]
         has_training = any(case.algorithm for case in cases_here)
-        if seed is None and study.has_curves and has_training:
+        if seed is None and study.draws_curves(self.name) and has_training:
             # A level for the learning curves.
             noise[GREEDY] = study.held_out(self.name)
         for file in files_at_marks:

@@ -18,7 +18,7 @@ import numpy as np
 
 from controllers import compile_functions
 from controllers.factories import nmpc, optimal
-from controllers.optimum import stored_optimum
+from controllers.stored_optimum import stored_optimum
 from cosim.core.protocols import Controller
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import simulate

@@ -18,6 +18,7 @@ from cosim.core.scenario import Scenario
 if TYPE_CHECKING:
     from controllers.linear import Lqr, PiLoops
     from controllers.optimum import OptimalPolicy, QuasiStaticPolicy
+    from controllers.periodic_optimum import PeriodicPolicy
 
 # Imported where it is needed: who simulates an RTI-NMPC shall not pay for SciPy and Clarabel.
 
@@ -132,11 +133,15 @@ def converged(scenario: Scenario) -> RtiNmpc:
     return naive(scenario, "converged")
 
 
-def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
+def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy | PeriodicPolicy:
     """Policy of least mean cost on the scenario's stochastic plant, solved once and then stored.
 
-    Where the plant fouls or jumps, the quasi-static one.
+    Where the plant fouls or jumps, the quasi-static one; where prices move, that of each phase.
     """
+    if scenario.signals:
+        from controllers.periodic_optimum import PeriodicPolicy  # noqa: PLC0415
+
+        return PeriodicPolicy.from_scenario(scenario)
     from controllers.optimum import OptimalPolicy, QuasiStaticPolicy, change_of  # noqa: PLC0415
 
     if change_of(scenario) is None:

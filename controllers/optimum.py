@@ -26,14 +26,14 @@ from controllers.dynamic_programming import (
     Settings,
     solve,
 )
-from controllers.errors import ModelError, OptimumError, QpError
+from controllers.errors import OptimumError, QpError
 from controllers.functions import COMPILED, INTERPRETED, LONG, worth_compiling
 from controllers.model import Model
 from controllers.policy_table import CompiledTable, PolicyTable
 from controllers.problem import VECTORS, PlantProblem, load_model
 from cosim.core.files import cache_folder, read_arrays, write_atomically
 from cosim.core.protocols import CompiledLoop, Decision, Vector
-from cosim.core.scenario import ChangeTable, Scenario, is_file
+from cosim.core.scenario import ChangeTable, Scenario
 
 SOLVER_VERSION = 2
 """Part of every key; to be raised when the solver's results change."""
@@ -637,30 +637,3 @@ class QuasiStaticPolicy:
             status="clamped" if clamped else "solved",
             residual=0.0,
         )
-
-
-def stored_optimum(scenario: Scenario) -> str | None:
-    """`optimal` where that is the plant's optimum and all of it is shipped or cached, else None.
-
-    A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
-    scenario names the plant's own model.
-    """
-    # Nobody knows which plant a foreign FMU is.
-    plant_is_known = scenario.plant.model is not None
-    if is_file(scenario.plant.fmu) and not plant_is_known:
-        return None
-    change = change_of(scenario)
-    # An optimum that is not stored would be solved for minutes: nobody has asked for that.
-    plants = change.plants if change else [scenario]
-    for plant in plants:
-        try:
-            problem = PlantProblem.from_scenario(plant)
-        except (ModelError, OptimumError):
-            return None
-        # No controller is told what this policy needs.
-        if problem.memory is not None:
-            return None
-        key = optimum_key(problem, Settings())
-        if stored_file(key) is None:
-            return None
-    return "optimal"

@@ -740,8 +740,8 @@ class PlantProblem:
         """
         if scenario.signals:
             raise OptimumError(
-                f"scenario '{scenario.name}' has signals, and the optimum is computed where "
-                "nothing moves with time: there is no J* of this scenario yet"
+                f"scenario '{scenario.name}' has signals, and this optimum is of a plant where "
+                "nothing moves with time: take controllers.periodic_optimum"
             )
         filtered = _filtered(scenario)
         _require_whole_state(scenario, filtered)

@@ -74,7 +74,7 @@ def _of_model(
         return Varying(table.name, "disturbance", index, nominal)
     if name in parameters:
         index = parameters.index(name)
-        kind: VaryingKind = "price" if _is_price(model, index) else "parameter"
+        kind: VaryingKind = "price" if is_price(model, index) else "parameter"
         nominal = model.parameters[index].nominal
         return Varying(table.name, kind, index, nominal)
     raise ModelError(
@@ -111,7 +111,7 @@ def _moving_reference(
     return Varying(table.name, "reference", index, nominal)
 
 
-def _is_price(model: Model, index: int) -> bool:
+def is_price(model: Model, index: int) -> bool:
     """Whether a parameter is in the economic cost and not in the dynamics."""
     symbols = model.symbols()
     *_, p = symbols

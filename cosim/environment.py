@@ -15,9 +15,10 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
-from cosim.core.errors import PlantError
+from cosim.core.errors import PlantError, ScenarioError
 from cosim.core.protocols import Array
 from cosim.core.scenario import Scenario
+from cosim.core.signals import ahead_of, signals_of
 from cosim.core.simulation import spawn_seeds
 from cosim.plant import FmuPlant
 
@@ -35,9 +36,19 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     The reward is −(ℓ(x_k, u_k, d_k) + penalty(x_k)), so that J is minus its mean. Actions are
     saturated to the scenario's bounds, as actuators do. Where the scenario has sensors the
     observation is not x_k but (2·n_y,): of each sensor the last reading and its age in samples; 0
-    and −1 before the first one arrives. `reset(seed=K)` starts the episode that
-    `cosim simulate --seed K` runs; a later `reset()` draws a new one. `info` holds `stage_cost`,
-    `penalty` and `disturbance` (p,) of the step.
+    and −1 before the first one arrives. Behind this it has what is known of each signal then, the
+    present value and those of a preview, in the scenario's order. `reset(seed=K)` starts the
+    episode that `cosim simulate --seed K` runs; a later `reset()` draws a new one. `info` holds
+    `stage_cost`, `penalty` and `disturbance` (p,) of the step.
+
+    Args:
+        scenario: a scenario, its name or its file.
+        render_mode: `rgb_array`, or None.
+        most_steps: samples of an episode, which count where a signal ends or measures a
+            disturbance, whose course is foreseen at each reset.
+
+    Raises:
+        ScenarioError: a signal ends before so many samples.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own convention)
@@ -47,16 +58,20 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         scenario: Scenario | str | Path = "paper",
         *,
         render_mode: str | None = None,
+        most_steps: int = EPISODE_STEPS,
     ) -> None:
         self.render_mode = render_mode
         self._plant = FmuPlant(scenario)
         task = self.scenario
-        if task.signals:
-            self._plant.close()
-            raise PlantError(
-                f"scenario '{task.name}' has signals, which an observation does not have yet: use "
-                "cosim.simulate"
-            )
+        self._most_steps = most_steps
+        self._signals = signals_of(task)
+        if self._signals is not None:
+            try:
+                # The last observation is made after the last step.
+                self._signals.require(most_steps + 1)
+            except ScenarioError:
+                self._plant.close()
+                raise
         # The FMU's own ranges of its states.
         low, high = self._plant.state_range
         sensors = task.sensors or ()
@@ -67,6 +82,10 @@ class PlantEnv(gymnasium.Env[Array, Array]):
             least_age = np.full(n_sensors, -1.0)
             low = np.concatenate([least_reading, least_age])
             high = np.full(2 * n_sensors, np.inf)
+        # A forecast's error has no bounds.
+        n_known = self._n_known
+        low = np.concatenate([low, np.full(n_known, -np.inf)])
+        high = np.concatenate([high, np.full(n_known, np.inf)])
         self.observation_space = Box(low, high, dtype=np.float64)
         delays = [sensor.delay for sensor in sensors]
         self._delays: Array = np.array(delays, dtype=float)
@@ -84,6 +103,15 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     def scenario(self) -> Scenario:
         """The scenario that the plant realises."""
         return self._plant.scenario
+
+    @property
+    def _n_known(self) -> int:
+        """Values of signals in an observation."""
+        count = 0
+        for table in self.scenario.signals or ():
+            if table.known != "none":
+                count += 1 + ahead_of(table, self.scenario)
+        return count
 
     def reset(
         self,
@@ -112,6 +140,8 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         else:
             # The noise of a simulation on this seed.
             plant_seed, _ = spawn_seeds(seed)
+        if self._signals is not None:
+            self._signals.foresee(self._plant, plant_seed, self._most_steps + 1)
         s = self._plant.reset(plant_seed, start)
         self._states.clear()
         self._actions.clear()
@@ -122,6 +152,15 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         return observation, {}
 
     def _observation(self, s: Array, y: Array | None) -> Array:
+        """What is measured, and what is known of the signals behind it."""
+        measured = self._measured(s, y)
+        if self._signals is None:
+            return measured
+        known = self._signals.known(self._plant.k)
+        parts = [known[table.name] for table in self.scenario.signals or () if table.name in known]
+        return np.concatenate([measured, *parts])
+
+    def _measured(self, s: Array, y: Array | None) -> Array:
         """The state (n,); under sensors the last readings and their ages, (2·n_y,)."""
         if y is None:
             return s
@@ -142,12 +181,20 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         if shape != self.action_space.shape:
             raise PlantError(f"an action has shape {self.action_space.shape}, not {shape}")
         applied = self.scenario.saturate(action)
+        number = self._plant.k
+        if self._signals is not None and self._signals.measured and number >= self._most_steps:
+            raise PlantError(
+                f"nothing is foreseen beyond {self._most_steps} samples of an episode: give "
+                "most_steps"
+            )
         s, stage_cost, penalty, disturbance, y = self._plant.step(applied)
         info = {
             "stage_cost": stage_cost,
             "penalty": penalty,
             "disturbance": disturbance,
         }
+        if self._signals is not None:
+            self._signals.check_foreseen(disturbance[None], number)
         self._states.append(s)
         self._actions.append(applied)
         observation = self._observation(s, y)
@@ -196,11 +243,12 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         env: Any = PlantEnv(scenario, render_mode=render_mode)
         super().__init__(env)
         task: Scenario = env.scenario
-        if task.sensors:
-            raise PlantError(
-                f"scenario '{task.name}' has sensors, for whose readings there are no normalised "
-                "units: use PlantEnv"
-            )
+        for kind, tables in (("sensors", task.sensors), ("signals", task.signals)):
+            if tables:
+                raise PlantError(
+                    f"scenario '{task.name}' has {kind}, for whose values there are no normalised "
+                    "units: use PlantEnv"
+                )
         self._scenario = task
         width = task.state_upper - task.state_lower
         magnitude = np.abs(task.reference_state)

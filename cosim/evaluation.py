@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from controllers.optimum import stored_optimum
+from controllers.stored_optimum import stored_optimum
 from cosim.core import statistics
 from cosim.core.errors import EvaluationError
 from cosim.core.files import staged

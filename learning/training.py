@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from controllers import compile_functions
 from controllers.estimator import measured
 from controllers.factories import nmpc
-from controllers.optimum import stored_optimum
 from controllers.rti import RtiNmpc
+from controllers.stored_optimum import stored_optimum
 from controllers.theta import Parameters
 from cosim.core.errors import CapabilityError
 from cosim.core.files import check_target, staged, write_atomically

@@ -359,20 +359,7 @@ class BellmanOperator:
             states = grid.points[part]
             actions_of_part = actions[part]
             cost, x_next = self._expected_cost(states, actions_of_part)
-            count, n_nodes = x_next[0].shape
-            shape = (count, grid.size)
-            row_numbers = np.arange(count)
-            rows = np.repeat(row_numbers, n_nodes)
-            # From state b to each corner of the cell that node q leads to: its probability times
-            # the corner's weight. Entries of the same place add up.
-            matrix = sparse.csr_array(shape)
-            for index, weight in grid.weights(x_next):
-                probabilities = weight * self._weights
-                entries = probabilities.reshape(-1)
-                columns = index.reshape(-1)
-                places = (rows, columns)
-                matrix += sparse.csr_array((entries, places), shape=shape)
-            return matrix, cost
+            return self._transition(x_next, grid), cost
 
         # Rows of the grid's states in their order, whichever thread makes them.
         parts = self._map(rows_of, grid.size)
@@ -380,22 +367,112 @@ class BellmanOperator:
         transition = sparse.vstack(matrices, format="csr")
         return transition, np.concatenate(costs)
 
+    def transitions(
+        self,
+        states: Array,
+        actions: Array,
+        grid: Grid,
+    ) -> tuple[sparse.csr_array, Array]:
+        """Where actions lead, whatever a sample costs.
+
+        Args:
+            states: States, (B, n).
+            actions: Actions, (B, m).
+            grid: The grid.
+
+        Returns:
+            Weights of the grid's states in the expectation of a function of s₊, (B, G), and
+            E[penalty(s₊)], (B,).
+        """
+        from scipy import sparse  # noqa: PLC0415
+
+        def rows_of(part: slice) -> tuple[sparse.csr_array, Array]:
+            arguments, shape = self._arguments(states[part], actions[part])
+            x_next = self._next_states(arguments, shape)
+            return self._transition(x_next, grid), self._expected_penalty(x_next)
+
+        parts = self._map(rows_of, len(states))
+        matrices, penalties = zip(*parts, strict=True)
+        return sparse.vstack(matrices, format="csr"), np.concatenate(penalties)
+
+    def stage_costs(
+        self,
+        states: Array,
+        actions: Array,
+        parameters: Array,
+    ) -> Array:
+        """E[ℓ(s, a, d)] where the plant's parameters are others, prices say, (B,).
+
+        Args:
+            states: States, (B, n).
+            actions: Actions, (B, m).
+            parameters: Parameters of the plant, (n_p,).
+        """
+
+        def costs_of(part: slice) -> Array:
+            arguments, shape = self._arguments(states[part], actions[part])
+            x, u, d, _ = arguments
+            (stage_cost,) = self._cost(x, u, d, parameters)
+            return _mean(np.broadcast_to(stage_cost, shape), self._weights)
+
+        return np.concatenate(list(self._map(costs_of, len(states))))
+
+    def _transition(self, x_next: Sequence[Array], grid: Grid) -> sparse.csr_array:
+        """Weights of the grid's states (B, G) in the expectation of a function of s₊.
+
+        Args:
+            x_next: s₊ at the nodes, n arrays (B, q).
+            grid: The grid.
+        """
+        from scipy import sparse  # noqa: PLC0415
+
+        count, n_nodes = x_next[0].shape
+        shape = (count, grid.size)
+        row_numbers = np.arange(count)
+        rows = np.repeat(row_numbers, n_nodes)
+        # From state b to each corner of the cell that node q leads to: its probability times
+        # the corner's weight. Entries of the same place add up.
+        matrix = sparse.csr_array(shape)
+        for index, weight in grid.weights(x_next):
+            probabilities = weight * self._weights
+            entries = probabilities.reshape(-1)
+            columns = index.reshape(-1)
+            places = (rows, columns)
+            matrix += sparse.csr_array((entries, places), shape=shape)
+        return matrix
+
+    def _arguments(
+        self,
+        states: Array,
+        actions: Array,
+    ) -> tuple[tuple[Sequence[Array], ...], tuple[int, int]]:
+        """Arguments of the model's functions, which broadcast, and the shape (B, q) of a result."""
+        # States and actions (B, 1) with disturbances (1, q): all arrays broadcast to (B, q).
+        arguments = (
+            [column[:, None] for column in states.T],
+            [column[:, None] for column in actions.T],
+            self._disturbance,
+            list(self._parameters),
+        )
+        return arguments, (len(states), len(self._weights))
+
+    def _next_states(
+        self,
+        arguments: Sequence[Sequence[Array]],
+        shape: tuple[int, int],
+    ) -> list[Array]:
+        """s₊ at the nodes, n arrays (B, q)."""
+        next_entries = self._step(*arguments)
+        return [np.broadcast_to(entry, shape) for entry in next_entries]
+
     def _expected_cost(
         self,
         states: Array,
         actions: Array,
     ) -> tuple[Array, list[Array]]:
         """E[ℓ + penalty(s₊)], shape (B,), and s₊ at the nodes, n arrays (B, q)."""
-        # States and actions (B, 1) with disturbances (1, q): all arrays broadcast to (B, q).
-        arguments = (
-            [column[:, None] for column in states.T],
-            [column[:, None] for column in actions.T],
-            self._disturbance,
-            self._parameters,
-        )
-        shape = (len(states), len(self._weights))
-        next_entries = self._step(*arguments)
-        x_next = [np.broadcast_to(entry, shape) for entry in next_entries]
+        arguments, shape = self._arguments(states, actions)
+        x_next = self._next_states(arguments, shape)
         (stage_cost,) = self._cost(*arguments)
         at_nodes = np.broadcast_to(stage_cost, shape)
         cost = _mean(at_nodes, self._weights)

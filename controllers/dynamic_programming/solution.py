@@ -463,11 +463,29 @@ def solve(
         OptimumError: The bounds do not close to 1 % of the gain, or the closed loop leaves the
             grid's box in more than one of 10⁴ samples.
     """
-    problem = plant.problem
     settings = settings or Settings()
     accuracy = settings.accuracy(plant)
     draft = BellmanOperator(plant, accuracy.draft(), workers=workers)
     operator = BellmanOperator(plant, accuracy, workers=workers)
+    iterate = draft_solution(draft, settings, progress)
+    # All so far was a start; the solution is of the full accuracy.
+    solution = _iterate(operator, iterate, settings.level, settings, progress)
+    return _accepted(solution)
+
+
+def draft_solution(
+    draft: BellmanOperator,
+    settings: Settings,
+    progress: RoundProgress | None = None,
+) -> Optimum:
+    """A policy near the optimal one on the grid of the last level.
+
+    Args:
+        draft: The Bellman operator, of little accuracy.
+        settings: The solver's settings.
+        progress: Called after each round.
+    """
+    problem = draft.problem
     run = partial(_iterate, settings=settings, progress=progress)
     approach = partial(run, draft, scan_points=5, start_only=True)
 
@@ -488,10 +506,7 @@ def solve(
 
     # One round that looks for better actions in the whole action box.
     last_level = settings.level
-    iterate = run(draft, iterate, last_level, scan_points=9, rounds=1)
-    # All so far was a start; the solution is of the full accuracy.
-    solution = run(operator, iterate, last_level)
-    return _accepted(solution)
+    return run(draft, iterate, last_level, scan_points=9, rounds=1)
 
 
 def _iterate(

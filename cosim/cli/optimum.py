@@ -44,7 +44,7 @@ def optimum(
             out_.announce(task.plant.fmu)
             with cosim.FmuPlant(task) as plant:
                 plant.require_cost_of_sample()
-        if change_of(task) is not None:
+        if change_of(task) is not None and not task.signals:
             policy = QuasiStaticPolicy.from_scenario(task, progress=_show_rounds(out_))
             _show_quasi_static(policy, task, out_)
             return
@@ -84,6 +84,8 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: cosim.Scenario, out_: cl
 
 def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
+    if task.signals:
+        return _solve_periodic(task, refine, recompute, out_)
     from controllers import optimum as store
     from controllers.dynamic_programming import GainEstimate, Settings, certify, objection, solve
     from controllers.problem import PlantProblem
@@ -138,6 +140,70 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
         "file": str(path),
         "certificate": [figure._asdict() for figure in certificate] or None,
         "states": solution.grid.shape,
+        "accuracy": asdict(solution.accuracy),
+    }
+
+
+def _solve_periodic(
+    task: cosim.Scenario,
+    refine: bool,
+    recompute: bool,
+    out_: cli.Output,
+) -> dict[str, Any]:
+    """The same of a scenario with signals; says first what it takes."""
+    from controllers import periodic_optimum as store
+    from controllers.dynamic_programming import GainEstimate, Settings, objection
+    from controllers.dynamic_programming.periodic import certify_periodic, solve_periodic
+    from controllers.optimum import stored_file
+
+    periodic = store.periodic_plant(task)
+    settings = Settings()
+    key = store.periodic_key(periodic, settings)
+    path = None if recompute else stored_file(key)
+    if path is None or refine:
+        minutes = store.expected_seconds(periodic, refine=refine) / 60
+        out_.note(
+            f"{task.name}: {periodic.period} phases of {task.sampling_time:g} s, about "
+            f"{minutes:.0f} minutes on this machine as it is"
+        )
+    if path is None:
+        solution = solve_periodic(periodic, settings, progress=out_.note)
+        path = store.keep_periodic(key, solution)
+    # What is stored is rounded: it is this policy that is certified and used.
+    solution = store.read_periodic(path, key)
+    if refine:
+        solution = certify_periodic(periodic, settings, solution, progress=out_.note)
+        path = store.keep_periodic(key, solution)
+    certificate = solution.certificate
+    why_not: str | None = "no certificate; make one with --refine"
+    if certificate:
+        why_not = objection(certificate)
+    kind = "reference" if why_not else "optimum"
+    own_gain = GainEstimate("solution", solution.gain, solution.lower, solution.upper)
+    rows = []
+    for name, *numbers in certificate or [own_gain]:
+        cells = [f"{number:.4f}" for number in numbers]
+        rows.append((name, *cells))
+    sizes = [str(count) for count in solution.grid.shape]
+    states = " × ".join(sizes)
+    title = (
+        f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states in "
+        f"{periodic.period} phases"
+    )
+    out_.table(title, ("", "J", "from", "to"), rows)
+    if why_not is not None:
+        out_.note(f"not called J*: {why_not}")
+    return {
+        "scenario": task.name,
+        "kind": kind,
+        "objection": why_not,
+        "J": solution.gain,
+        "lower": solution.lower,
+        "upper": solution.upper,
+        "file": str(path),
+        "certificate": [figure._asdict() for figure in certificate] or None,
+        "states": solution.grid.shape,
+        "phases": periodic.period,
         "accuracy": asdict(solution.accuracy),
     }
 

@@ -5,7 +5,8 @@ import pytest
 
 from controllers.errors import OptimumError
 from controllers.factories import optimal
-from controllers.optimum import QuasiStaticPolicy, change_of, fouling, stored_optimum
+from controllers.optimum import QuasiStaticPolicy, change_of, fouling
+from controllers.stored_optimum import stored_optimum
 from cosim import FmuPlant, Scenario
 
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from cosim import FmuPlant, simulate
-from cosim.core.errors import PlantError
+from cosim import FmuPlant, Scenario, simulate
+from cosim.core.errors import PlantError, ScenarioError
 from cosim.environment import NormalisedEnv, PlantEnv
 from tests.helpers.loop import Proportional
 
@@ -134,3 +134,38 @@ def test_under_sensors_it_shows_the_last_readings_and_their_ages():
     assert (readings[:, 3] == 0.0).all()
     with pytest.raises(PlantError, match="no normalised units"):
         NormalisedEnv("late")
+
+
+def test_under_signals_it_shows_what_is_known_of_them():
+    env = PlantEnv("set-point")
+    rows = [env.reset(seed=4)[0]]
+    for _ in range(240):
+        rows.append(env.step(env.scenario.reference_action)[0])
+    seen = np.array(rows)
+    # The bound now, and one and two samples ahead: it steps at sample 240.
+    assert env.observation_space.contains(seen[-1])
+    assert seen[237, 2:].tolist() == [25.0, 25.0, 25.0]
+    assert seen[238, 2:].tolist() == [25.0, 25.0, 30.0]
+    assert seen[240, 2:].tolist() == [30.0, 30.0, 30.0]
+    with pytest.raises(PlantError, match="no normalised units"):
+        NormalisedEnv("set-point")
+
+
+def test_a_measured_disturbance_is_foreseen_for_an_episode():
+    env = PlantEnv("forecast", most_steps=3)
+    s, _ = env.reset(seed=4)
+    for _ in range(3):
+        present = s[[2, 13]]
+        s, _, _, _, info = env.step(env.scenario.reference_action)
+        # X1 and T1, each with its preview of ten samples.
+        assert present.tolist() == info["disturbance"][[0, 2]].tolist()
+    with pytest.raises(PlantError, match="beyond 3 samples"):
+        env.step(env.scenario.reference_action)
+
+
+def test_a_signal_that_ends_too_early_is_refused(paper):
+    signal = {"name": "low", "values": [25.0], "once": 600.0, "bound": "x_l[X2]", "known": "now"}
+    scenario = Scenario.from_dict(paper.to_dict() | {"signal": [signal]})
+    with pytest.raises(ScenarioError, match="ends after 600 s"):
+        PlantEnv(scenario)
+    assert PlantEnv(scenario, most_steps=9).reset(seed=0)[0].shape == (3,)

@@ -422,8 +422,7 @@ class _OnALog(ModelBased):
         distance = self._problem.state_upper - self._problem.state_lower
         most = np.tile(settings.largest_back_off * distance, 2)
         kept = np.clip(self.back_off + shift, 0.0, most)
-        bounds = self._signals.bounds(range(len(inputs)))
-        least = self.least_back_offs(kept, inputs, bounds)
+        least = self.least_back_offs(kept, inputs)
         search = BackOffOnModel(
             self._problem,
             self._rollout,

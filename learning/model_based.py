@@ -395,7 +395,7 @@ class ModelBased(Algorithm):
         self,
         present: Array,
         inputs: Array,
-        bounds: tuple[Array, Array],
+        bounds: tuple[Array, Array] | None = None,
     ) -> Array:
         """Least back-offs that the data allow.
 
@@ -407,7 +407,7 @@ class ModelBased(Algorithm):
         Args:
             present: back-offs, (2n,).
             inputs: (s, a, v) of the present regime, (M, n+m+n_v).
-            bounds: true ones of the states at these samples, (M, n) each.
+            bounds: true ones of the states at these samples, (M, n) each; None: they do not move.
         """
         settings = self.configuration
         problem = self._problem
@@ -418,7 +418,7 @@ class ModelBased(Algorithm):
             floor = np.minimum(self._floor, present)
         # What the plant has shown: its distances from the true bounds.
         states = inputs[:, : problem.n_states]
-        lower, upper = bounds
+        lower, upper = bounds or (problem.state_lower, problem.state_upper)
         above = states - lower
         below = upper - states
         distances = np.concatenate([above, below], axis=1)

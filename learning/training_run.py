@@ -319,12 +319,6 @@ def begin_training(
         algorithm: class of its rule.
         plant: of its scenario.
     """
-    if run.scenario.signals and not getattr(algorithm, "learns_under_signals", False):
-        raise ConfigurationError(
-            f"scenario '{run.scenario.name}' has signals, which {run.algorithm} cannot learn with "
-            "yet: use q-learning or fixed, or train on the same scenario without [[signal]] and "
-            "simulate or evaluate the θ on this one"
-        )
     if run.scenario.sensors and not getattr(algorithm, "learns_from_estimates", False):
         raise ConfigurationError(
             f"{run.algorithm} learns from exact states, and scenario '{run.scenario.name}' has "
@@ -332,6 +326,12 @@ def begin_training(
         )
     if run.scenario.sensors:
         algorithm = getattr(algorithm, "under_sensors", algorithm)
+    if run.scenario.signals and not getattr(algorithm, "learns_under_signals", False):
+        raise ConfigurationError(
+            f"scenario '{run.scenario.name}' has signals, which {run.algorithm} cannot learn with "
+            "yet: use q-learning, model-based or fixed, or train on the same scenario without "
+            "[[signal]] and simulate or evaluate the θ on this one"
+        )
     # Each source of randomness has its own stream, so that settings keep runs paired.
     start = run.starting_parameters()
     controller = nmpc(run.scenario, start, run.controller)

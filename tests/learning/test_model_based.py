@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from learning.known_signals import KnownSignals
 from learning.log import to_csv
 from learning.model_based import BackOffOnModel, ExpectedCosts, ModelBased
 from learning.rollout import RolloutSamples
@@ -23,7 +24,7 @@ def riding(problem, theta_at_start):
         inputs = np.tile([theta[where], 60.0, 220.0, 230.0], (len(picks), 1))
         return RolloutSamples(inputs, predicted, np.ones((len(picks), 3)))
 
-    return lambda thetas, start, model, picks: [one(theta, picks) for theta in thetas]
+    return lambda thetas, start, model, picks, met: [one(theta, picks) for theta in thetas]
 
 
 @pytest.fixture
@@ -40,7 +41,11 @@ def make_search(scenario, problem, tuned_theta, rng):
         visited = np.tile([27.0, 60.0, 220.0, 230.0], (settings.recent_samples, 1))
         visited[0, 0] = 20.0
         rollout = riding(problem, tuned_theta)
-        return BackOffOnModel(problem, rollout, tuned_theta, model, visited, settings, rng)
+        signals = KnownSignals(scenario, problem, settings.recent_samples)
+        numbers = range(len(visited))
+        return BackOffOnModel(
+            problem, rollout, tuned_theta, model, visited, settings, rng, signals, numbers
+        )
 
     return make
 

@@ -89,9 +89,9 @@ def test_a_resumed_training_gives_the_same_digits(tmp_path, name, changes):
     assert not np.array_equal(whole.learned.theta, start)
 
 
-@pytest.mark.parametrize("algorithm", ["batch-q-learning", "actor-critic", "model-based", "dyna"])
+@pytest.mark.parametrize("algorithm", ["batch-q-learning", "actor-critic", "dyna"])
 def test_a_rule_that_solves_past_samples_again_is_refused(algorithm):
-    with pytest.raises(ConfigurationError, match="use q-learning or fixed"):
+    with pytest.raises(ConfigurationError, match="use q-learning, model-based or fixed"):
         train(algorithm, "prices", 40)
 
 
@@ -100,6 +100,14 @@ def test_a_signal_that_ends_before_the_training_is_refused():
     scenario = Scenario.load("prices").replace({"signal": [once]})
     with pytest.raises(CosimError, match="ends after 720 s"):
         run_training(make_run(scenario=scenario))
+
+
+@pytest.mark.slow
+def test_back_offs_are_searched_where_the_bound_steps():
+    """The search knows the steps to come: its θ costs less where they are met."""
+    training = train("model-based", "set-point", 960, start="cautious", seed=0)
+    assert training.evaluation["difference_interval"][1] < 0.0
+    assert training.evaluation["violating_share"] < 1e-3
 
 
 @pytest.mark.slow

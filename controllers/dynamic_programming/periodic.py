@@ -38,9 +38,8 @@ ACTION_NODES = 7
 """Nodes of the polynomial in each action."""
 DRAFT_NODES = 5
 """The same while boxes of actions are looked for."""
-LATTICE_POINTS = 17
-"""Points of an action's range at which the polynomial is compared: of 6335 on `prices` their
-distance costs less than 0.03."""
+LATTICE_POINTS = 11
+"""Points of an action's range at which the polynomials are compared."""
 FIRST_REACH = 0.06
 """Half width of the first box of actions about the still plant's policy, as a share of the
 actuators' range."""
@@ -156,41 +155,41 @@ def lagrange_weights(nodes: Array, x: Array) -> Array:
 def minimise_polynomials(values: Array, n_actions: int) -> tuple[Array, Array]:
     """Minimise polynomials on [−1, 1]^m that are given at the products of Chebyshev nodes.
 
-    Their least values on a lattice; parabolas through a point's neighbours say where between the
-    lattice's points the minimiser is.
+    Their least values on a lattice, less what a parabola through a point's neighbours gains in each
+    action.
 
     Args:
         values: of B polynomials, the last action running fastest, (r^m, B).
         n_actions: m.
 
     Returns:
-        Minimisers (B, m), and the least values on the lattice, (B,).
+        Minimisers (B, m), and the least values, (B,).
     """
     n_nodes = round(len(values) ** (1 / n_actions))
     lattice = np.linspace(-1.0, 1.0, LATTICE_POINTS)
     weights = lagrange_weights(chebyshev_nodes(n_nodes), lattice)
-    table = values.reshape(*[n_nodes] * n_actions, -1)
+    all_weights = np.ones((1, 1))
     for _ in range(n_actions):
-        # The first action's nodes become the lattice's points, and go behind the other actions.
-        rows = table.reshape(n_nodes, -1)
-        shape = (LATTICE_POINTS, *table.shape[1:])
-        table = np.moveaxis((weights @ rows).reshape(shape), 0, n_actions - 1)
-    shape = table.shape[:-1]
-    flat = table.reshape(-1, table.shape[-1])
-    columns = np.arange(flat.shape[1])
-    place = flat.argmin(axis=0)
-    least = flat[place, columns]
+        all_weights = np.kron(all_weights, weights)
+    on_lattice = all_weights @ values
+    columns = np.arange(values.shape[1])
+    place = on_lattice.argmin(axis=0)
+    lowest = on_lattice[place, columns]
+    least = lowest.copy()
     minimisers = np.empty((len(columns), n_actions))
     spacing = lattice[1] - lattice[0]
-    strides = np.cumprod((1, *shape[:0:-1]))[::-1]
+    shape = (LATTICE_POINTS,) * n_actions
     for i, index in enumerate(np.unravel_index(place, shape)):
         interior = (index > 0) & (index < LATTICE_POINTS - 1)
-        stride = np.where(interior, strides[i], 0)
-        before = flat[place - stride, columns]
-        after = flat[place + stride, columns]
-        curvature = np.where(interior, before - 2 * least + after, 1.0)
-        shift = np.where(curvature > 0, 0.5 * (before - after) / np.maximum(curvature, 1e-300), 0)
-        minimisers[:, i] = lattice[index] + spacing * np.clip(shift, -0.5, 0.5)
+        stride = np.where(interior, LATTICE_POINTS ** (n_actions - 1 - i), 0)
+        slope = 0.5 * (on_lattice[place + stride, columns] - on_lattice[place - stride, columns])
+        around = on_lattice[place + stride, columns] + on_lattice[place - stride, columns]
+        curvature = np.where(interior, around - 2 * lowest, 1.0)
+        # At a minimum of the lattice it is negative by rounding alone.
+        curvature = np.maximum(curvature, 1e-300)
+        shift = np.clip(-slope / curvature, -0.5, 0.5)
+        least += slope * shift + 0.5 * curvature * shift**2
+        minimisers[:, i] = lattice[index] + spacing * shift
     return minimisers, least
 
 

@@ -180,16 +180,22 @@ def minimise_polynomials(values: Array, n_actions: int) -> tuple[Array, Array]:
     spacing = lattice[1] - lattice[0]
     shape = (LATTICE_POINTS,) * n_actions
     for i, index in enumerate(np.unravel_index(place, shape)):
-        interior = (index > 0) & (index < LATTICE_POINTS - 1)
-        stride = np.where(interior, LATTICE_POINTS ** (n_actions - 1 - i), 0)
-        slope = 0.5 * (on_lattice[place + stride, columns] - on_lattice[place - stride, columns])
-        around = on_lattice[place + stride, columns] + on_lattice[place - stride, columns]
-        curvature = np.where(interior, around - 2 * lowest, 1.0)
-        # At a minimum of the lattice it is negative by rounding alone.
-        curvature = np.maximum(curvature, 1e-300)
-        shift = np.clip(-slope / curvature, -0.5, 0.5)
-        least += slope * shift + 0.5 * curvature * shift**2
-        minimisers[:, i] = lattice[index] + spacing * shift
+        # At the end of the lattice the parabola is that about the next point.
+        centre = np.clip(index, 1, LATTICE_POINTS - 2)
+        stride = LATTICE_POINTS ** (n_actions - 1 - i)
+        middle = place + (centre - index) * stride
+        before = on_lattice[middle - stride, columns]
+        after = on_lattice[middle + stride, columns]
+        slope = 0.5 * (after - before)
+        curvature = after + before - 2 * on_lattice[middle, columns]
+        # A polynomial that is not convex there has its least value on the lattice.
+        is_convex = curvature > 0
+        vertex = np.clip(-slope / np.where(is_convex, curvature, 1.0), -1.0, 1.0)
+        at_lattice = index - centre
+        offset = np.where(is_convex, vertex, at_lattice)
+        least += slope * (offset - at_lattice)
+        least += 0.5 * curvature * (offset**2 - at_lattice**2)
+        minimisers[:, i] = lattice[centre] + spacing * offset
     return minimisers, least
 
 

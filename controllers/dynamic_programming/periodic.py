@@ -168,9 +168,9 @@ def minimise_polynomials(values: Array, n_actions: int) -> tuple[Array, Array]:
     n_nodes = round(len(values) ** (1 / n_actions))
     lattice = np.linspace(-1.0, 1.0, LATTICE_POINTS)
     weights = lagrange_weights(chebyshev_nodes(n_nodes), lattice)
-    all_weights = np.ones((1, 1))
-    for _ in range(n_actions):
-        all_weights = np.kron(all_weights, weights)
+    all_weights: Array = weights
+    for _ in range(n_actions - 1):
+        all_weights = np.kron(all_weights, weights).astype(np.float64)
     on_lattice = all_weights @ values
     columns = np.arange(values.shape[1])
     place = on_lattice.argmin(axis=0)

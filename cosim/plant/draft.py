@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import textwrap
 from collections import defaultdict
@@ -40,6 +41,8 @@ PARAMETERS_OF_NOISE = {
 }
 """Field of the scenario's disturbances, and what our own plants call its parameter after NAME."""
 COSTS = ("cost", "loss", "objective")
+SENSORS_PROPOSED = 12
+"""Sensors that a draft proposes at most."""
 INPUTS_SHOWN = 12
 """Inputs that a remark names at most."""
 
@@ -208,7 +211,8 @@ def draft_scenario(
             path = os.path.relpath(archive.path, target.resolve().parent)
             document["plant"]["fmu"] = Path(path).as_posix()
     remarks = _remarks(document, archive, units) | remarks | more_remarks
-    return with_remarks(tomli_w.dumps(document), remarks)
+    text = with_remarks(tomli_w.dumps(document), remarks)
+    return text + _proposed_sensors(document, archive)
 
 
 def _known_states(fmu: str | Path) -> tuple[str, ...]:
@@ -554,6 +558,42 @@ def _remarks(
     if "model" not in document["controller"]:
         remarks["controller"] += '; add model = "my_plant:model", a model in CasADi'
     return remarks
+
+
+def _proposed_sensors(
+    document: Mapping[str, Any],
+    fmu: UnpackedFmu,
+) -> str:
+    """Sensors of the states and the other outputs as comments: which there are, only a user knows.
+
+    Args:
+        document: of the draft, at its steady state.
+        fmu: the FMU.
+    """
+    plant = document["plant"]
+    values = dict(zip(plant["states"], plant["initial_state"], strict=True))
+    taken = {*plant["disturbances"], plant["stage_cost"]}
+    for name in _reals(fmu, "output"):
+        if name not in taken:
+            values.setdefault(name, start_value(fmu, name))
+    lines = [
+        "",
+        "# CHECK: without sensors a controller is given each state, exactly, at each sample.",
+        "# What is measured instead, an estimator makes a state of: take away the # of those that",
+        "# there are. A slow one has every = 15 and delay = 15, in samples.",
+    ]
+    for name, value in list(values.items())[:SENSORS_PROPOSED]:
+        # A transmitter's error is about a hundredth of what it reads.
+        deviation = float(f"{abs(value) / 100:.1g}")
+        unit = fmu.unit(name)
+        remark = f" # {unit}; CHECK" if unit else " # CHECK"
+        lines += [
+            "#",
+            "# [[sensor]]",
+            f"# variable = {json.dumps(name)}",
+            f"# deviation = {deviation}{remark}",
+        ]
+    return "\n".join([*lines, ""])
 
 
 def with_remarks(text: str, remarks: Mapping[str, str]) -> str:

@@ -74,6 +74,12 @@ def test_a_foreign_fmu_needs_no_more_than_names_and_a_time(cosim, tank, tmp_path
     assert drift(drafted) < 1e-9
     text = (tmp_path / "tank.toml").read_text()
     assert "CHECK: the FMU states no bound of x" in text
+    # The sensors that it proposes are comments, and valid once they are none.
+    lines = text.splitlines()
+    proposed = [line.removeprefix("# ") for line in lines[lines.index("# [[sensor]]") :]]
+    (tmp_path / "measured.toml").write_text("\n".join(['extends = "tank.toml"', *proposed]))
+    assert drafted.sensors is None
+    assert Scenario.load(tmp_path / "measured.toml").sensors[0].variable == "x"
     code, _, err = cosim("scenario", "init", tank, "--sampling-time", 0.5, "--out", "tank.toml")
     assert code == 2 and "--overwrite" in err
 

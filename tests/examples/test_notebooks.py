@@ -16,7 +16,7 @@ SMALLER = {
     '["naive", "backed-off"]': '["naive", "tuned"]',
     '"start": "backed-off"': '"start": "tuned"',
 }
-NAMES = ("evaluate", "study", "train")
+NAMES = ("evaluate", "sensors", "study", "train")
 
 
 def read(name):

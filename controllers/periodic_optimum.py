@@ -228,13 +228,17 @@ def expected_seconds(periodic: PeriodicPlant, *, refine: bool = False) -> float:
     actions = np.tile(problem.reference_action, (count, 1))
     axes = [np.linspace(x - 1.0, x + 1.0, 9) for x in problem.reference_state]
     grid = Grid(tuple(axes))
+    # The first call loads what it needs.
+    operator.transitions(states[:1], actions[:1], grid)
     begin = perf_counter()
     operator.transitions(states, actions, grid)
     per_state = (perf_counter() - begin) / count
-    # Some 1500 states: drafts, then 49 nodes on four boxes; a phase takes as much as 30 states.
-    states_of_nodes = 1500 * (200 + 4 * 49)
-    phases = 6 * periodic.period
-    return per_state * (states_of_nodes + 30 * phases)
+    # Counted on `prices`, in states: some 1500 of the grid, and five periods.
+    work = 1500 * 140 + 80 * periodic.period
+    if refine:
+        # A grid of three times as many states, three periods on it, and the simulation.
+        work += 1500 * 210 + 240 * periodic.period
+    return per_state * work
 
 
 # the policy -----------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
@@ -16,7 +15,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from controllers.dynamic_programming import Accuracy, BellmanOperator, GainEstimate, Grid, Settings
 from controllers.dynamic_programming.periodic import (
@@ -39,6 +38,10 @@ from cosim.core.validation import instead
 
 PERIODIC_VERSION = 1
 """Part of every key; to be raised when the solver's results change."""
+ACTION_STEPS = 4096
+"""Steps of an actuator's range to which stored actions are rounded."""
+VALUE_STEP = 1e-3
+"""Share of the gain to which stored values are rounded."""
 LONGEST_PERIOD = 10_080
 """Most samples of a period: each has a policy of its own."""
 
@@ -135,18 +138,27 @@ def periodic_key(periodic: PeriodicPlant, settings: Settings) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def keep_periodic(key: str, optimum: PeriodicOptimum) -> Path:
-    """Keep a solution in the user's cache; its values are rounded to single precision.
+def keep_periodic(key: str, periodic: PeriodicPlant, optimum: PeriodicOptimum) -> Path:
+    """Keep a solution in the user's cache, rounded: a policy for each phase would be large.
+
+    Actions are multiples of a 4096th of the actuators' range, values of a thousandth of the gain;
+    from phase to phase few of them differ.
 
     Args:
         key: Its `periodic_key`.
+        periodic: The plant.
         optimum: The solution.
 
     Returns:
         The file.
     """
+    problem = periodic.plant.problem
+    action_step = (problem.action_upper - problem.action_lower) / ACTION_STEPS
+    value_step = abs(optimum.gain) * VALUE_STEP or 1.0
     document = {
         "key": key,
+        "action_step": action_step.tolist(),
+        "value_step": value_step,
         "gain": optimum.gain,
         "lower": optimum.lower,
         "upper": optimum.upper,
@@ -154,13 +166,24 @@ def keep_periodic(key: str, optimum: PeriodicOptimum) -> Path:
         "certificate": [estimate._asdict() for estimate in optimum.certificate],
     }
     arrays: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(optimum.grid.axes)}
-    arrays["actions"] = optimum.actions.astype(np.float32)
-    arrays["W"] = optimum.W.astype(np.float32)
+    arrays["action_changes"] = _changes(optimum.actions / action_step)
+    arrays["value_changes"] = _changes(optimum.W / value_step)
     arrays["document"] = np.array(json.dumps(document, sort_keys=True))
     # Through memory, so that the file appears whole or not at all.
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     return write_atomically(cache_folder("optima") / f"{key}.npz", buffer.getvalue())
+
+
+def _changes(values: Array) -> NDArray[np.int32]:
+    """Values (P, …), rounded to whole numbers, as changes from phase to phase."""
+    whole = np.rint(values).astype(np.int64)
+    return np.diff(whole, axis=0, prepend=0).astype(np.int32)
+
+
+def _along(changes: NDArray[np.int32]) -> Array:
+    """Whole numbers of which these are the changes from phase to phase, (P, …)."""
+    return np.cumsum(changes, axis=0, dtype=np.int64).astype(np.float64)
 
 
 def read_periodic(path: Path, key: str) -> PeriodicOptimum:
@@ -183,8 +206,8 @@ def read_periodic(path: Path, key: str) -> PeriodicOptimum:
         accuracy = document["accuracy"]
         return PeriodicOptimum(
             grid=Grid(tuple(axes)),
-            actions=arrays["actions"],
-            W=arrays["W"],
+            actions=_along(arrays["action_changes"]) * np.array(document["action_step"]),
+            W=_along(arrays["value_changes"]) * float(document["value_step"]),
             gain=float(document["gain"]),
             lower=float(document["lower"]),
             upper=float(document["upper"]),
@@ -285,7 +308,8 @@ class PeriodicPolicy:
         key = periodic_key(periodic, Settings())
         path = stored_file(key)
         if path is None:
-            path = keep_periodic(key, solve_periodic(periodic, progress=progress))
+            solution = solve_periodic(periodic, progress=progress)
+            path = keep_periodic(key, periodic, solution)
         # Read back in any case: a policy that was solved now is the one that is stored.
         return cls(periodic, read_periodic(path, key))
 
@@ -330,9 +354,7 @@ class PeriodicPolicy:
         phase = max(self._sample, 0) % self._periodic.period
         if self._table is None or phase != self._phase:
             optimum = self.optimum
-            actions = optimum.actions[phase].astype(np.float64)
-            W: Array = optimum.W[phase].astype(np.float64)
-            axes: Sequence[Array] = optimum.grid.axes
-            self._table = PolicyTable(axes, actions, W)
+            axes = optimum.grid.axes
+            self._table = PolicyTable(axes, optimum.actions[phase], optimum.W[phase])
             self._phase = phase
         return self._table

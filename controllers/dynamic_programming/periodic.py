@@ -534,12 +534,11 @@ def _refinement(
     finer = refined(still, draft, settings, settings.level + 1)
     states = list(finer.grid.points.T)
     linear = Grid(optimum.grid.axes)
-    actions = optimum.actions.astype(np.float64)
-    least = _interpolated(linear, actions.min(axis=0), states)
-    most = _interpolated(linear, actions.max(axis=0), states)
+    least = _interpolated(linear, optimum.actions.min(axis=0), states)
+    most = _interpolated(linear, optimum.actions.max(axis=0), states)
     margin = np.maximum(MARGIN * (most - least), LEAST_MARGIN * _actuator_range(periodic))
     boxes = _within_actuators(periodic, least - margin, most + margin)
-    W = linear.interpolant(optimum.W[0].astype(np.float64))(states)
+    W = linear.interpolant(optimum.W[0])(states)
     return _solved(periodic, operator, finer.grid, W, boxes, settings)
 
 

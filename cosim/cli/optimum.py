@@ -168,12 +168,12 @@ def _solve_periodic(
         )
     if path is None:
         solution = solve_periodic(periodic, settings, progress=out_.note)
-        path = store.keep_periodic(key, solution)
+        path = store.keep_periodic(key, periodic, solution)
     # What is stored is rounded: it is this policy that is certified and used.
     solution = store.read_periodic(path, key)
     if refine:
         solution = certify_periodic(periodic, settings, solution, progress=out_.note)
-        path = store.keep_periodic(key, solution)
+        path = store.keep_periodic(key, periodic, solution)
     certificate = solution.certificate
     why_not: str | None = "no certificate; make one with --refine"
     if certificate:

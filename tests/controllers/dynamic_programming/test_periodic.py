@@ -124,7 +124,7 @@ def test_a_policy_that_is_stored_is_that_of_the_phase(solution, monkeypatch, tmp
     periodic = priced(PRICES)
     key = periodic_key(periodic, Settings())
     assert key != periodic_key(priced(-PRICES), Settings())
-    stored = read_periodic(keep_periodic(key, solution), key)
+    stored = read_periodic(keep_periodic(key, periodic, solution), key)
     policy = PeriodicPolicy(periodic, stored)
     near = solution.grid.nearest([0.05])
     (x,) = solution.grid.points[near].tolist()
@@ -132,11 +132,13 @@ def test_a_policy_that_is_stored_is_that_of_the_phase(solution, monkeypatch, tmp
     for k in [0, 1, 2, 3, 4, 0, 1]:
         policy.prepare()
         decision = policy.feedback([x])
-        assert decision.action == pytest.approx(solution.actions[k, near], abs=1e-6)
-        assert decision.value == pytest.approx(solution.W[k, near], abs=1e-6)
+        # Rounded to a 4096th of the actuator's range, and a thousandth of the gain.
+        assert decision.action == pytest.approx(solution.actions[k, near], abs=6.0 / 8192)
+        assert decision.value == pytest.approx(solution.W[k, near], abs=1e-3 * solution.gain)
     policy.reset()
     policy.prepare()
-    assert policy.feedback([x]).action == pytest.approx(solution.actions[0, near], abs=1e-6)
+    expected = solution.actions[0, near]
+    assert policy.feedback([x]).action == pytest.approx(expected, abs=6.0 / 8192)
     assert policy.feedback([99.0]).status == "clamped"
     with pytest.raises(QpError):
         policy.feedback([np.nan])

@@ -15,6 +15,7 @@ from controllers.theta import Parameters, ThetaBlocks
 if TYPE_CHECKING:
     from controllers.estimator import ExtendedKalmanFilter, OutputFeedback
     from controllers.optimum import OptimalPolicy
+    from controllers.plant import build_plant
 
 __all__ = [
     "ControllerError",
@@ -31,6 +32,7 @@ __all__ = [
     "RtiNmpc",
     "RtiSolution",
     "ThetaBlocks",
+    "build_plant",
     "compile_functions",
 ]
 
@@ -40,5 +42,6 @@ __getattr__, _, _ = lazy_loader.attach(
     submod_attrs={
         "estimator": ["ExtendedKalmanFilter", "OutputFeedback"],
         "optimum": ["OptimalPolicy"],
+        "plant": ["build_plant"],
     },
 )

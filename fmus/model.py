@@ -14,6 +14,7 @@ from enum import StrEnum
 from fractions import Fraction
 from functools import cache, cached_property, partial
 from importlib.metadata import version as version_of
+from math import isinf
 from os.path import commonprefix
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -500,6 +501,9 @@ def _real_attributes(
         # FMI forbids a nominal value of zero.
         if value is None or (key == "nominal" and value == 0.0):
             continue
+        # What is not bounded has no attribute: XML's own INF is not for every importer.
+        if isinf(value):
+            continue
         attributes[key] = float(value)
     # An array has one attribute with the starts of all its elements.
     if variable.start is not None and variable.name in model.arrays:
@@ -643,6 +647,10 @@ def _start_and_range(most: float, variable: Variable) -> tuple[float, ...]:
     if variable.type in (Type.SEED, Type.SEED_HIGH):
         low = 0.0
         high = 2.0**32 - 1
+    # C's tables have no infinity.
+    largest = sys.float_info.max
+    low = max(low, -largest)
+    high = min(high, largest)
     numbers = (variable.start, low, high, nominal)
     # Nothing and −0.0 are written as 0.0.
     return tuple(float(number or 0.0) for number in numbers)

@@ -13,9 +13,15 @@ NEXT = {
     "rule": ["cosim train --algorithm NAME:CLASS --samples 400 --out NAME-run"],
     "controller": ["cosim evaluate --controllers naive,NAME:make --steps 100 --out NAME-run"],
     "plant": [
-        "python build_NAME.py",
-        "cosim scenario init NAME.fmu --out NAME-drafted.toml",
-        "cosim simulate --scenario NAME.toml --steps 500 --out NAME-run",
+        "python NAME.py",
+        "cosim fmu check NAME.fmu --model NAME:model",
+        "cosim scenario init NAME.fmu --model NAME:model --out NAME.toml",
+        "cosim tuning --scenario NAME.toml",
+        "cosim train --scenario NAME.toml --algorithm model-based --start cautious --samples 1440 "
+        "--evaluation-seeds 2 --evaluation-steps 500 --out NAME-learned",
+        "cosim evaluate --scenario NAME.toml --controllers "
+        "naive,cautious,NAME-learned/parameters.toml --seeds 3 --steps 1000 --out NAME-run",
+        "cosim export NAME-learned/parameters.toml --scenario NAME.toml --format c --out NAME-c",
     ],
     "study": ["cosim study run NAME.toml --out NAME-run"],
 }
@@ -30,7 +36,8 @@ def new(
 ) -> None:
     """Write a skeleton that runs, and print the commands; replaces no file.
 
-    A rule and a controller are Python modules, a plant is C, a model and a scenario, a study TOML.
+    A rule and a controller are Python modules, a plant, its equations too; a study is
+    TOML.
 
     Args:
         name: Name of files, module and class.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Sequence
 from json import dumps
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +15,9 @@ import cosim
 from cosim.cli import output as cli
 from cosim.core.errors import CosimError
 from cosim.core.files import write_atomically
+
+OVER_PRICE = 100
+"""Drafted penalty of a bound over its price."""
 
 
 class ShowByDefault(TyperGroup):
@@ -103,6 +108,7 @@ def draft(
     states: str = "",
     actions: str = "",
     cost: str | None = None,
+    model: Annotated[str | None, typer.Option("--model", "-m")] = None,
     sampling_time: Annotated[float | None, typer.Option(min=1e-9, max=1e12)] = None,
     state: str = "",
     action: str = "",
@@ -121,6 +127,8 @@ def draft(
         states: Names, comma-separated.
         actions: Names, comma-separated.
         cost: Output that is the stage cost.
+        model: The controller's model, module:factory; with one, penalties follow from the prices of
+            bounds.
         sampling_time: Sampling time in s.
         state: Where to look for the steady state: numbers.
         action: The same of the actions.
@@ -146,11 +154,13 @@ def draft(
             sampling_time=sampling_time,
             state=_numbers(state, "--state"),
             action=_numbers(action, "--action"),
+            model=model,
         )
         # Whether the model is accurate is known only of a scenario that is valid.
         drafted = _parsed_scenario(text, target)
         if drafted.controller.model is not None:
             text = _with_enough_substeps(text, drafted)
+            text = _with_priced_penalty(text, drafted)
         write_atomically(target, text)
         # As any later command reads it.
         drafted = cosim.Scenario.load(target)
@@ -189,6 +199,57 @@ def _with_enough_substeps(text: str, scenario: cosim.Scenario) -> str:
     heading = "[controller]\n"
     line = f"substeps = {substeps} # so that the model is accurate at the bounds\n"
     return text.replace(heading, heading + line, 1)
+
+
+def _with_priced_penalty(text: str, scenario: cosim.Scenario) -> str:
+    """The draft, with penalties of a hundred times the prices of the model's active bounds.
+
+    A violation of a bound that is not active costs as much as that of the dearest one, by the same
+    share of its range. It then pays to violate a bound in about a hundredth of the samples. Where
+    no bound of a state is active the draft's penalties stay.
+    """
+    from math import isfinite
+
+    import numpy as np
+
+    from controllers.economic import optimal_steady_state
+    from controllers.errors import TuningError
+    from controllers.problem import Problem
+
+    # A penalty below a bound's price would not keep it, and the price would not show.
+    n = len(scenario.plant.states)
+    document = scenario.to_dict()
+    document["penalty"]["linear"] = [1e12] * n
+    problem = Problem.from_scenario(cosim.Scenario.from_dict(document))
+    try:
+        steady = optimal_steady_state(problem)
+    except TuningError:
+        return text
+    is_active = steady.C[:, :n].any(axis=0)
+    prices = np.where(is_active, np.abs(steady.multipliers[:n]), 0.0)
+    spans = problem.state_upper - problem.state_lower
+    spans = np.where(np.isfinite(spans), spans, 1.0)
+    dearest = float((prices * spans).max())
+    if not (dearest > 0 and isfinite(dearest)):
+        return text
+    exact = OVER_PRICE * np.maximum(prices, dearest / spans)
+    weights = [float(f"{weight:.1g}") for weight in exact.tolist()]
+    before = f"linear = {_toml_list(scenario.penalty.linear)}"
+    after = f"linear = {_toml_list(weights)}"
+    remark = (
+        f"{OVER_PRICE} times what bounds cost by the model ({'; '.join(steady.prices())}): one "
+        f"that is active is then violated in about one sample in {OVER_PRICE} at best"
+    )
+    lines = textwrap.wrap(remark, 98, break_on_hyphens=False)
+    commented = "".join(f"# {line}\n" for line in lines)
+    return text.replace(before, commented + after, 1)
+
+
+def _toml_list(values: Sequence[float]) -> str:
+    """Numbers as `tomli_w` writes them in one key."""
+    import tomli_w
+
+    return tomli_w.dumps({"values": list(values)}).partition(" = ")[2].strip()
 
 
 def _numbers(text: str, option: str) -> list[float]:

@@ -162,6 +162,7 @@ def draft_scenario(
     sampling_time: float | None = None,
     state: Sequence[float] = (),
     action: Sequence[float] = (),
+    model: str | None = None,
 ) -> str:
     """Text of a scenario file for an FMU, with a remark above each value that needs one.
 
@@ -174,6 +175,7 @@ def draft_scenario(
         sampling_time: Sampling time in s; without it the FMU's own step size.
         state: Where the search for the steady state begins, (n,); without it the FMU's start.
         action: The same of the actions, (m,).
+        model: The controller's model, module:factory.
 
     Returns:
         The text, TOML.
@@ -204,8 +206,10 @@ def draft_scenario(
     if str(fmu) in SHIPPED_FMUS:
         # Of a plant's two FMUs, FMI 2.0 and 3.0, the model is one.
         plant_name = str(fmu).removesuffix("_fmi3")
-        document["controller"]["model"] = f"controllers.{plant_name}:model"
-    else:
+        model = model or f"controllers.{plant_name}:model"
+    if model is not None:
+        document["controller"]["model"] = model
+    if str(fmu) not in SHIPPED_FMUS:
         # A file on another drive keeps its absolute path.
         with suppress(ValueError):
             path = os.path.relpath(archive.path, target.resolve().parent)

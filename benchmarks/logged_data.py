@@ -34,7 +34,7 @@ PLANTS = (RANDOM_PLANTS + COLOURED_PLANTS)[1:30:3]
 REGIMES = ("pi", "lqr", "cautious", "steps")
 EXCITED = ("cautious", "steps")
 """Regimes in which something moves the inputs about the states that matter."""
-FIRST_SEED, LOGS = 720_000, 5
+FIRST_SEED, LOGS = 740_000, 5
 """Noise of the logs, and their number for each plant and regime."""
 WEEK = 7 * 86400.0
 """Length of a log in s."""

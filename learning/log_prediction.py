@@ -23,50 +23,37 @@ from learning.empirical_model import EmpiricalModel
 from learning.model_based import ExpectedCosts, ModelBasedConfiguration
 from learning.rollout import Rollout
 
-
-class Costs(NamedTuple):
-    """Costs that D drawn models predict of the M samples that count.
-
-    Attributes:
-        samples: (D, M); infinite where a model's rollout is lost.
-        other_errors: the mean of each model with as many errors, drawn anew from those that it
-            made of the log, less that with all of them, (D,).
-    """
-
-    samples: Array
-    other_errors: Array
-
-    @classmethod
-    def none(cls, n_models: int, n_samples: int) -> Costs:
-        """Of rollouts that are all lost."""
-        return cls(np.full((n_models, n_samples), np.inf), np.zeros(n_models))
+ERRORS_AT = 64
+"""Samples of each model at which the errors' shares of a penalty are weighed."""
 
 
 class PredictedCosts(NamedTuple):
-    """What is predicted of several θ and of the log.
+    """Costs that D drawn models predict of the M samples that count.
 
     Attributes:
-        thetas: of each θ.
-        logged: of the logged operation.
+        thetas: of each θ, (D, M) each; infinite where a model's rollout is lost.
+        logged: of the logged operation, (D, M).
         outside: share of the first θ's samples in which a state is where the plant has not been.
     """
 
-    thetas: list[Costs]
-    logged: Costs
+    thetas: list[Array]
+    logged: Array
     outside: float
 
 
 class _Expectation:
-    """What a model expects of samples, with its errors and with as many drawn anew from them.
+    """What a model expects of the samples of a rollout, as shares in the mean cost.
 
-    Rare errors make most of a penalty: how many of them a log happens to have is its chance, too.
+    An error of the log has two parts in the mean: it moved the states that followed, and it is one
+    of the errors over which each sample's penalty is expected. A rare error makes most of a
+    penalty, so that both belong in the share of its sample: their chance is one.
 
     Args:
         problem: has the penalty.
-        model: has the errors.
+        model: its errors are those of the log, in their order.
         settings: of the expected penalty.
+        number: of the model, so that each weighs its errors at other samples.
         burn_in: samples before those that count.
-        rng: draws errors.
     """
 
     def __init__(
@@ -74,42 +61,39 @@ class _Expectation:
         problem: Problem,
         model: EmpiricalModel,
         settings: ModelBasedConfiguration,
+        number: int,
         burn_in: int,
-        rng: np.random.Generator,
     ) -> None:
-        n_errors = len(model.residuals)
-        drawn_anew = rng.integers(n_errors, size=n_errors)
-        other = replace(model, residuals=model.residuals[drawn_anew])
         self._expected = ExpectedCosts(problem, model, settings)
-        self._expected_of_other = ExpectedCosts(problem, other, settings)
+        self._penalty = problem.penalty
+        self._errors = model.residuals[:, : problem.n_states]
+        self._number = number
         self._burn_in = burn_in
 
-    def keep(
-        self,
-        costs: Costs,
-        number: int,
-        predicted: Array,
-        h: Array,
-        limit: float = np.inf,
-    ) -> None:
-        """Store the costs of samples, unless one is above the limit.
+    def __call__(self, predicted: Array, h: Array) -> Array:
+        """Shares in the mean cost of the samples that count, of the mean of their expected costs.
 
         Args:
-            costs: where they are stored.
-            number: of the model.
             predicted: (s₊, ℓ) without residual, (T, K).
             h: sizes of the errors, (T, K).
-            limit: of the magnitude of a sample's cost.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            of_all, _ = self._expected(predicted, h)
-            of_other, _ = self._expected_of_other(predicted, h)
-        # A NaN is not below, either.
-        if (np.abs(of_all) < limit).all():
-            counted = of_all[self._burn_in :]
-            counted_of_other = of_other[self._burn_in :]
-            costs.samples[number] = counted
-            costs.other_errors[number] = (counted_of_other - counted).mean()
+            costs, _ = self._expected(predicted, h)
+            counted = costs[self._burn_in :]
+            penalties = self._by_error(predicted, h)[self._burn_in :]
+            shares: Array = counted + penalties - penalties.mean()
+            return shares
+
+    def _by_error(self, predicted: Array, h: Array) -> Array:
+        """Mean penalty of the samples if each had this one error, (T,)."""
+        count, n = self._errors.shape
+        every = max(count // ERRORS_AT, 1)
+        rows = np.arange(self._number % every, count, every)
+        errors = h[rows, None, :n] * self._errors
+        states = predicted[rows, None, :n] + errors
+        penalties = self._penalty.along(states.reshape(-1, n))
+        mean: Array = penalties.reshape(len(rows), count).mean(axis=0)
+        return mean
 
 
 class Prediction:
@@ -163,11 +147,11 @@ class Prediction:
         n_samples = len(self._inputs)
         start = self._inputs[0, : self._problem.n_states]
         picks = np.arange(n_samples, dtype=np.int32)
-        n_counted = n_samples - self._burn_in
-        logged = Costs.none(count, n_counted)
+        shape = (count, n_samples - self._burn_in)
+        logged = np.empty(shape)
         costs = []
         for _ in thetas:
-            costs.append(Costs.none(count, n_counted))
+            costs.append(np.full(shape, np.inf))
         outside = []
         models = self._model.draws(
             self._inputs,
@@ -179,17 +163,21 @@ class Prediction:
         )
         for number, drawn in enumerate(models):
             model, errors_before = self._repeating(drawn)
-            expectation = _Expectation(self._problem, model, self._settings, self._burn_in, rng)
+            expectation = _Expectation(self._problem, model, self._settings, number, self._burn_in)
             predicted, h, _ = model.predict(self._inputs)
             persists = h * (errors_before @ model.persistence.T)
-            expectation.keep(logged, number, predicted + persists, h)
+            logged[number] = expectation(predicted + persists, h)
             # A rollout beyond a million times the log's largest cost has run away.
-            limit = 1e6 * float(np.abs(logged.samples[number]).max())
+            limit = 1e6 * float(np.abs(logged[number]).max())
             rollouts = self._rollout(thetas, start, model, picks)
             for cost, samples in zip(costs, rollouts, strict=True):
                 # A loop that runs away ends early.
-                if len(samples.inputs) == n_samples:
-                    expectation.keep(cost, number, samples.predicted, samples.h, limit)
+                if len(samples.inputs) < n_samples:
+                    continue
+                shares = expectation(samples.predicted, samples.h)
+                # A NaN is not below, either.
+                if (np.abs(shares) < limit).all():
+                    cost[number] = shares
             states = rollouts[0].inputs[self._burn_in :, : self._problem.n_states]
             if len(states):
                 outside.append(self._share_outside(states))
@@ -224,18 +212,18 @@ class Prediction:
 
 
 def difference(
-    costs: Costs,
-    others: Costs,
+    costs: Array,
+    others: Array,
     stretches: Sequence[int],
 ) -> tuple[Estimate, float]:
     """Mean difference of predicted costs, with an interval that holds model and chance.
 
-    The variance is that over models, of the mean over samples; that of the mean over stretches of
-    the log, of the mean over models; and that of the errors which the log happens to have.
+    The variance is that over models, of the mean over samples, and that of the mean over stretches
+    of the log, of the mean over models.
 
     Args:
-        costs: of D models and M samples.
-        others: what is subtracted.
+        costs: of D models and M samples, (D, M).
+        others: what is subtracted, (D, M).
         stretches: numbers of stretches that the log is parted in; the one counts by which the mean
             spreads most.
 
@@ -243,34 +231,27 @@ def difference(
         The estimate, without interval where a model's cost is not finite; and the models' share of
         its variance.
     """
-    if not np.isfinite(costs.samples).all():
+    if not np.isfinite(costs).all():
         return Estimate(np.inf), 1.0
-    if not np.isfinite(others.samples).all():
+    if not np.isfinite(others).all():
         return Estimate(-np.inf), 1.0
-    differences = costs.samples - others.samples
+    differences = costs - others
     mean_by_model = differences.mean(axis=1)
     value = float(mean_by_model.mean())
-    freedom_of_models = len(differences) - 1
     variance_of_models = float(mean_by_model.var(ddof=1))
-    by_other_errors = costs.other_errors - others.other_errors
-    variance_of_errors = float(np.mean(by_other_errors**2))
+    freedom_of_models = len(costs) - 1
     mean_by_sample = differences.mean(axis=0)
     variance_of_chance, freedom_of_chance = _chance(mean_by_sample, stretches)
 
-    parts = [
-        (variance_of_models, freedom_of_models),
-        (variance_of_errors, len(differences)),
-        (variance_of_chance, freedom_of_chance),
-    ]
-    variance = sum(part for part, _ in parts)
-    if not variance:
-        return Estimate(value, (value, value)), 0.0
-    # Degrees of freedom of a sum of variances (Welch and Satterthwaite).
-    freedom = 1.0 / sum((part / variance) ** 2 / of_part for part, of_part in parts)
+    variance = variance_of_models + variance_of_chance
+    share = variance_of_models / variance if variance else 0.0
+    # Degrees of freedom of a sum of two variances (Welch and Satterthwaite).
+    part_of_models = share**2 / freedom_of_models
+    part_of_chance = (1.0 - share) ** 2 / freedom_of_chance
+    freedom = 1.0 / (part_of_models + part_of_chance)
     quantile = float(stdtrit(freedom, 0.5 + LEVEL / 2))
     half_width = quantile * variance**0.5
-    interval = (value - half_width, value + half_width)
-    return Estimate(value, interval), variance_of_models / variance
+    return Estimate(value, (value - half_width, value + half_width)), share
 
 
 def _chance(values: Array, stretches: Sequence[int]) -> tuple[float, int]:

@@ -16,7 +16,7 @@ from learning.empirical_model import EmpiricalModel
 from learning.from_data import excitation
 from learning.log_checks import usable
 from learning.log_configuration import LogConfiguration
-from learning.log_prediction import Costs, difference
+from learning.log_prediction import difference
 from tests.helpers.empirical import SETTINGS, fit, plant_data
 
 LOG = LogConfiguration()
@@ -179,25 +179,21 @@ def test_a_differences_variance_is_of_models_and_of_chance(rng):
     # Eight stretches, within which costs are the same: sixteen would not be independent.
     chance = rng.normal(0.0, 8.0, 8)
     costs = 5.0 + models + np.repeat(chance, 100)
-    of_errors = rng.normal(0.0, 1.0, LOG.drawn_models)
-    none = Costs(np.zeros_like(costs), np.zeros(LOG.drawn_models))
-    estimate, share = difference(Costs(costs, of_errors), none, LOG.stretches)
+    estimate, share = difference(costs, np.zeros_like(costs), LOG.stretches)
     of_models = models.var(ddof=1)
     of_chance = chance.var(ddof=1) / 8
     low, high = estimate.interval
-    variance = of_models + of_chance + (of_errors**2).mean()
-    deviation = variance**0.5
-    assert share == pytest.approx(of_models / variance)
+    deviation = (of_models + of_chance) ** 0.5
+    assert share == pytest.approx(of_models / (of_models + of_chance))
     assert estimate.value == pytest.approx(costs.mean())
     # Between the quantiles of a normal law and of the fewest degrees of freedom.
     assert 1.96 * deviation < (high - low) / 2 < 2.37 * deviation
 
 
 def test_a_lost_rollout_leaves_no_interval():
-    no_change = np.zeros(LOG.drawn_models)
-    costs = Costs(np.ones((LOG.drawn_models, 100)), no_change)
-    lost = Costs(costs.samples.copy(), no_change)
-    lost.samples[3] = np.inf
+    costs = np.ones((LOG.drawn_models, 100))
+    lost = costs.copy()
+    lost[3] = np.inf
     assert difference(lost, costs, LOG.stretches)[0].interval is None
     assert difference(costs, lost, LOG.stretches)[0].interval is None
 

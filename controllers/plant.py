@@ -67,14 +67,6 @@ def build_plant(
     Raises:
         ModelError: The model cannot be C by itself, or a name or number does not fit it.
         BuildError: There is no compiler, or it refuses the equations.
-
-    Example:
-        >>> from controllers import heater
-        >>> limits = {"Q": (0.0, 60.0), "F": (0.0, 20.0)}
-        >>> build_plant(heater.model(), "heater.fmu", sampling_time=60.0, limits=limits)
-        Traceback (most recent call last):
-        ...
-        controllers.errors.ModelError: …
     """
     ranges = dict(ranges or {})
     time_constants = dict(time_constants or {})
@@ -89,6 +81,13 @@ def build_plant(
     _check_names(model, "time_constants", time_constants, disturbances)
     _check_names(model, "values", values, known)
     _check_names(model, "units", units, computed)
+    _check_numbers(model, "ranges", ranges, 0.0)
+    _check_numbers(model, "time_constants", time_constants, 0.0)
+    _check_numbers(model, "values", values, -inf)
+    if not (isfinite(sampling_time) and sampling_time > 0):
+        raise ModelError(
+            f"model '{model.name}': sampling_time must be positive seconds, not {sampling_time!r}"
+        )
     for quantity in model.actions:
         low, high = limits.get(quantity.name, (-inf, inf))
         if not (isfinite(low) and isfinite(high)):
@@ -210,14 +209,29 @@ def _check_names(
             raise ModelError(f"model '{model.name}': {argument} has '{name}'{instead(name, known)}")
 
 
+def _check_numbers(
+    model: Model,
+    argument: str,
+    values: Mapping[str, float],
+    least: float,
+) -> None:
+    """Refuse what is no finite number, or below the least one."""
+    for name, value in values.items():
+        if not isfinite(value) or value < least:
+            sign = " of at least 0" if least == 0 else ""
+            raise ModelError(
+                f"model '{model.name}': {argument} of {name} must be a finite number{sign}, not "
+                f"{value!r}"
+            )
+
+
 def _check_identifiers(model: Model, identifiers: list[str]) -> None:
     """Refuse names that C does not know apart, or that the FMU needs for itself."""
     for quantities in (model.states, model.actions, model.disturbances, model.parameters):
-        for name in _names(quantities):
+        for name in [model.name, *_names(quantities), *model.outputs]:
             if not name.isidentifier() or not name.isascii():
                 raise ModelError(
-                    f"model '{model.name}': '{name}' is no name of a variable in C: letters, "
-                    "digits and _"
+                    f"model '{model.name}': '{name}' is no name in C: letters, digits and _"
                 )
     doubled = sorted({name for name in identifiers if identifiers.count(name) > 1})
     if doubled:

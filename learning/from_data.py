@@ -61,6 +61,18 @@ class KnownParameter(NamedTuple):
     shown: float
 
 
+class Direction(NamedTuple):
+    """A direction of the parameters' and nominal disturbances' errors, over their priors.
+
+    Attributes:
+        shown: share of its prior variance that the log has removed.
+        weights: of each parameter and disturbance, in their order, (p,); of length one.
+    """
+
+    shown: float
+    weights: tuple[float, ...]
+
+
 @dataclass(frozen=True, repr=False)
 class TrainingFromData(Shown):
     """What a log has taught.
@@ -82,7 +94,8 @@ class TrainingFromData(Shown):
         model_share: share of the variance that comes from what the log does not say of the plant,
             of the difference that is shown least; the rest is the chance of its disturbances.
         parameters_known: of each parameter and nominal disturbance of the model.
-        directions_shown: number of the directions of these that the log shows.
+        prior_deviation: standard deviation of their errors before the log, as a share.
+        directions: of these, what the log shows least first.
         excitation: of each action, the part of its standard deviation that does not follow from
             the states, as a share of its range.
         cost_is_modelled: whether the stage cost is the model's, since it was not logged.
@@ -105,7 +118,8 @@ class TrainingFromData(Shown):
     start_against_logged: Estimate
     model_share: float
     parameters_known: tuple[KnownParameter, ...]
-    directions_shown: int
+    prior_deviation: float
+    directions: tuple[Direction, ...]
     excitation: Mapping[str, float]
     cost_is_modelled: bool
     outside: float
@@ -122,6 +136,12 @@ class TrainingFromData(Shown):
     def parameters(self) -> Parameters:
         """The θ to use: the learned one where it is better, else the start's."""
         return self.learned if self.verdict == "better" else self.start
+
+    @property
+    def directions_shown(self) -> int:
+        """Number of the directions that the log shows."""
+        least = self.log_settings.least_shown
+        return sum(direction.shown > least for direction in self.directions)
 
     @property
     def experiment(self) -> str:
@@ -200,7 +220,8 @@ class TrainingFromData(Shown):
             **differences,
             "share_of_variance_from_the_model": self.model_share,
             "parameters_known": known,
-            "directions": len(self.parameters_known),
+            "directions": [direction._asdict() for direction in self.directions],
+            "prior_deviation": self.prior_deviation,
             "directions_shown": self.directions_shown,
             "excitation": dict(self.excitation),
             "stage_cost_by_the_model": self.cost_is_modelled,
@@ -275,7 +296,8 @@ def _check_run(run: TrainingRun) -> None:
         if tables:
             raise ConfigurationError(
                 f"scenario '{run.scenario.name}' has {kind}, and a log is used only where the "
-                "states themselves are logged and nothing moves with time but them"
+                "states themselves are logged and nothing moves with time but them: log the "
+                "states, or train without --data, in operation; `cosim shadow` takes such a log"
             )
 
 
@@ -329,12 +351,7 @@ def _train(
     model_share = share_against_start
     if _upper_end(against_logged) > _upper_end(against_start):
         model_share = share_against_logged
-    known, directions_shown = _known_parameters(
-        problem,
-        model,
-        settings,
-        log_settings.least_shown,
-    )
+    known, directions = _known_parameters(problem, model, settings)
     return TrainingFromData(
         run=run,
         log_settings=log_settings,
@@ -351,7 +368,8 @@ def _train(
         start_against_logged=start_against_logged,
         model_share=model_share,
         parameters_known=known,
-        directions_shown=directions_shown,
+        prior_deviation=settings.parameter_deviation,
+        directions=directions,
         excitation=excitation(data, run.scenario),
         cost_is_modelled=cost_is_modelled,
         outside=costs.outside,
@@ -522,15 +540,13 @@ def _known_parameters(
     problem: Problem,
     model: EmpiricalModel,
     settings: EmpiricalModelConfiguration,
-    least_shown: float,
-) -> tuple[tuple[KnownParameter, ...], int]:
-    """What the log says of each parameter, and the number of directions that it shows.
+) -> tuple[tuple[KnownParameter, ...], tuple[Direction, ...]]:
+    """What the log says of each parameter, and of directions of them, least shown first.
 
     Args:
         problem: names parameters and nominal disturbances.
         model: of the plant.
         settings: the prior of the fit.
-        least_shown: share of a direction's prior variance that the log must remove to show it.
     """
     p = model.features.n_parameters
     prior = settings.parameter_deviation
@@ -542,9 +558,15 @@ def _known_parameters(
         change = float(model.mean[i])
         deviation = prior * variance**0.5
         known.append(KnownParameter(quantity.name, change, deviation, 1.0 - variance))
-    eigenvalues = np.linalg.eigvalsh(left)
-    is_shown = 1.0 - eigenvalues > least_shown
-    return tuple(known), int(is_shown.sum())
+    eigenvalues, vectors = np.linalg.eigh(left)
+    directions = []
+    # Ascending is the variance that is left: what is shown least comes last.
+    for value, vector in zip(eigenvalues[::-1].tolist(), vectors.T[::-1], strict=True):
+        # Of a direction's two signs the one with its largest weight above zero.
+        sign = np.sign(vector[np.argmax(np.abs(vector))])
+        weights = tuple((sign * vector).tolist())
+        directions.append(Direction(1.0 - value, weights))
+    return tuple(known), tuple(directions)
 
 
 def excitation(data: LoggedData, scenario: Scenario) -> dict[str, float]:

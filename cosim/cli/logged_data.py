@@ -16,7 +16,9 @@ from cosim.core.training_options import PARAMETERS, TrainingOptions
 if TYPE_CHECKING:
     from learning.configuration import Configuration
 
-ANSWER_FILES = (PARAMETERS, "summary.json", "scenario.toml")
+KNOWN = "known.png"
+"""Figure of what the log says of the model."""
+ANSWER_FILES = (PARAMETERS, "summary.json", "scenario.toml", KNOWN)
 """Files of a training from logged data."""
 DataOption = Annotated[
     Path | None,
@@ -72,7 +74,7 @@ def train_from_data(
     out: Path,
     output: cli.Output,
 ) -> None:
-    """Learn θ from a log; write parameters.toml, summary.json and scenario.toml.
+    """Learn θ from a log; write parameters.toml, known.png, summary.json and scenario.toml.
 
     Args:
         algorithm: `model-based` or `batch-q-learning`.
@@ -86,6 +88,7 @@ def train_from_data(
         output: where tables go.
     """
     from cosim.core.files import staged, write_atomically
+    from cosim.figures.logged_data import known_figure
     from learning.from_data import train_from_data
 
     folder = cli.open_folder(out)
@@ -105,6 +108,7 @@ def train_from_data(
         answer.parameters.save(stage / PARAMETERS)
         write_atomically(stage / "scenario.toml", answer.run.scenario.to_toml())
         cli.write_summary(stage, summary)
+        known_figure(summary).savefig(stage / KNOWN)
     show_use(summary, output)
     _show_answer(summary, output)
     output.json(summary)
@@ -144,7 +148,7 @@ def _show_answer(summary: dict[str, Any], output: cli.Output) -> None:
         ("samples of θ where the plant has not been, %", f"{outside:.0f}"),
         (
             "directions of the model that the log shows",
-            f"{summary['directions_shown']} of {summary['directions']}",
+            f"{summary['directions_shown']} of {len(summary['directions'])}",
         ),
     ]
     title = f"{summary['algorithm']} from logged data on {summary['scenario']}: {summary['status']}"
@@ -161,6 +165,7 @@ def _show_answer(summary: dict[str, Any], output: cli.Output) -> None:
         )
     header = ("parameter or disturbance", "error %", "± %", "shown by the log %")
     output.table("what the log says of the model", header, known)
+    output.note(f"{KNOWN} draws this, and the directions that the log does not show")
     if summary["stage_cost_by_the_model"]:
         output.note("the file has no column stage_cost: the cost is the nominal model's")
     if summary["verdict"] == "better":

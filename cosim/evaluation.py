@@ -441,9 +441,14 @@ class Evaluation(Result):
         table = self.to_pandas()
         return str(table.to_csv(index=False, lineterminator="\n"))
 
-    def figure(self) -> Figure:
-        """Regret (J where J* is not known) with its intervals; economic cost against violation."""
+    def figure(self, width: float | None = None) -> Figure:
+        """Regret (J where J* is not known) and the share of violating samples, with intervals.
+
+        Args:
+            width: in inches; by default that of two columns of a journal.
+        """
         from cosim.figures.evaluation import evaluation_figure  # noqa: PLC0415 - matplotlib
+        from cosim.figures.style import WIDTH  # noqa: PLC0415
 
         columns = {name: self.columns[name] for name in self.controllers}
         scenario = self.facts["scenario"]
@@ -452,6 +457,7 @@ class Evaluation(Result):
             columns,
             title=f"{scenario}, {runs}, the same disturbances for all",
             optimal=None if self.optimum is None else self.optimal,
+            width=width or WIDTH,
         )
 
     def table(self) -> str:

@@ -234,9 +234,14 @@ class Training(Result):
         slices = self.parameters.blocks.slices
         return {name: moved[:, where] for name, where in slices.items()}
 
-    def figure(self) -> Figure:
-        """Cost, violations, TD error and θ over the samples."""
-        from cosim.figures.training import training_figure  # noqa: PLC0415 - matplotlib
+    def figure(self, width: float | None = None) -> Figure:
+        """Cost, violations, TD error and θ over the samples.
+
+        Args:
+            width: in inches; by default that of two columns of a journal.
+        """
+        from cosim.figures.style import WIDTH  # noqa: PLC0415 - matplotlib
+        from cosim.figures.training import training_figure  # noqa: PLC0415
 
         run = self.run
         blocks = self.parameters.blocks
@@ -252,9 +257,10 @@ class Training(Result):
             scaled,
             self.baselines,
             title=f"{run.algorithm} ({self.requires}) on {run.scenario.name} from "
-            f"{Path(run.start).stem}, seed {run.seed}: {end}, {self.verdict}\n"
+            f"{Path(run.start).stem}, seed {run.seed}: {end}, {self.verdict}. "
             f"J = {shown(self.J, digits=6)}, of the start {shown(self.start_J, digits=6)}, "
             f"difference {shown(*self.difference, digits=3)}",
+            width=width or WIDTH,
         )
 
     def animate(

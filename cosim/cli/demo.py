@@ -28,7 +28,9 @@ BEST = "model-based"
 DAY = 1440
 """Samples of a day: one a minute."""
 COMPARED_RUNS = 10
-"""Runs of the comparison; the first is drawn and recorded."""
+"""Runs of the comparison; of the first the beginning is drawn and recorded."""
+DRAWN = 300
+"""Samples that are drawn: of more, lines of four controllers cover each other."""
 
 
 def demo(
@@ -82,7 +84,7 @@ def demo(
             evaluation = cosim.evaluate(scenario, named, seeds, steps, progress=out_.live)
             for name in ("naive", START, BEST, "optimal"):
                 controller = cosim.build_controller(named[name], scenario)
-                run = cosim.simulate(plant, controller, steps, first)
+                run = cosim.simulate(plant, controller, min(steps, DRAWN), first)
                 runs[name] = run
                 signals[name] = RunSignals(name, run.signals, run.status, scenario.limits)
         summary: dict[str, Any] = evaluation.summary()

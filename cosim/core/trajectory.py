@@ -254,11 +254,15 @@ class Trajectory(Result):
         columns[STATUS] = list(self.status)
         return pd.DataFrame(columns)
 
-    def figure(self) -> Figure:
-        """States, actions, disturbances and costs over time, with their bounds."""
-        from cosim.figures.trajectory import trajectory_figure  # noqa: PLC0415 - matplotlib
+    def figure(self, width: float | None = None) -> Figure:
+        """States, actions, disturbances and costs over time, with their bounds.
 
-        return trajectory_figure(self, self.scenario)
+        Args:
+            width: in inches; by default that of two columns of a journal.
+        """
+        from cosim.figures.trajectory import WIDTH, trajectory_figure  # noqa: PLC0415 - matplotlib
+
+        return trajectory_figure(self, self.scenario, width=width or WIDTH)
 
     @property
     def time(self) -> Array:

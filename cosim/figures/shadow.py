@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cosim.core.protocols import Array
-from cosim.figures.style import BOUND, DASHED, REFERENCE, figure, label, palette
+from cosim.figures.style import BOUND, DASHED, REFERENCE, ask, figure, label, palette
 from cosim.figures.trajectory import time_unit
 
 ShownShadow = Any
@@ -51,6 +51,7 @@ def shadow_figure(shadow: ShownShadow) -> Figure:
         panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
         panels[-1].set_xlabel(f"time since the log's first row [{unit}]")
         drawn.align_ylabels()
+        ask(drawn, "Where would the controller have acted otherwise?")
     return drawn
 
 

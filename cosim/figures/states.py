@@ -29,7 +29,11 @@ OUTERMOST = 0.001
 # Densities
 
 
-def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure:
+def density_figure(
+    runs: Mapping[str, Trajectory],
+    scenario: Scenario,
+    width: float = style.SCREEN,
+) -> Figure:
     """Density of the first state against its lower bound, a line for each controller.
 
     The bins are common and an edge lies on the bound, so that no bin mixes both sides; the axis
@@ -38,20 +42,21 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
     Args:
         runs: trajectory of each controller.
         scenario: of the plant.
+        width: in inches.
     """
     state = scenario.plant.states[0]
     bound = float(scenario.state_lower[0])
     unit = _unit(runs, state)
     samples = {case: run[state] for case, run in runs.items()}
-    edges, width = _common_bins(list(samples.values()), bound)
+    edges, bin_width = _common_bins(list(samples.values()), bound)
     styles = palette(list(samples))
-    with style.figure(2.9, 4.6) as drawn:
+    with style.figure(3.2, width) as drawn:
         axes = drawn.subplots()
         for case, values in samples.items():
             color = styles[case].color
             # Not by `density=True`, which would leave out the samples outside of the bins.
             counts, _ = np.histogram(values, edges)
-            density = counts / (len(values) * width)
+            density = counts / (len(values) * bin_width)
             violates = bound - values > VIOLATING
             percent = 100 * np.mean(violates)
             label = f"{shown_case(case)}: {percent:.1f} % below"
@@ -76,6 +81,7 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
             ncols=2,
             borderaxespad=0.2,
         )
+        style.ask(drawn, f"How often is {style.label(state, '')} below its bound?")
     return drawn
 
 
@@ -178,7 +184,11 @@ def phase_figure(
             axes.set_xlabel(across)
         for axes in grid[:, 0]:
             axes.set_ylabel(upright)
-        drawn.supxlabel(_caption(scenario, longest), fontsize=7.0)
+        style.ask(
+            drawn,
+            "Where does each controller keep the plant, and how does it act there?",
+            _caption(scenario, longest),
+        )
     return drawn
 
 
@@ -206,7 +216,7 @@ def _caption(scenario: Scenario, longest: float) -> str:
     up = style.label(second_action, "")
     return (
         f"arrows: input less its operating point, right {right}, up {up}; the longest is "
-        f"{100 * longest:.0f} % of the input range\ncolour: how often the state was there, "
+        f"{100 * longest:.0f} % of the input range; colour: how often the state was there, "
         "logarithmic; red: bounds; cross: operating point"
     )
 

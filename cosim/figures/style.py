@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from colorsys import hls_to_rgb, rgb_to_hls
@@ -26,6 +27,12 @@ from cosim.core.protocols import Array
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""
+COLUMN = 3.5
+"""Width of a one-column figure in inches."""
+SCREEN = 4.6
+"""Width in inches of a page's figure: its letters can be read on a screen of 400 pixels."""
+NARROW = 5.5
+"""Width in inches below which panels stand below each other."""
 FORMATS = ("svg", "png")
 """Formats of the figures of a study."""
 FLOOR = 0.01
@@ -39,6 +46,9 @@ BOUND = "#B2182B"
 REFERENCE = "#5A6570"
 INK = "#222222"
 END_SIZE = 6.5
+TITLE_SIZE = 9.0
+DETAIL_SIZE = 7.0
+"""Sizes in points of the names at lines' ends, of a figure's question, of what stands below it."""
 DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F",
@@ -58,6 +68,8 @@ _KNOWN = {
     "pi": "#B08D57",
     "lqr": "#8C8CD9",
     "learnt": "#56B4E9",
+    "backed-off": "#C9A227",
+    "cautious": "#882255",
 }
 """Colours of the rules and controllers that every figure knows."""
 _OTHERS = ("#CC6677", "#A6761D", "#E377C2", "#6D9E1F", "#B04FD0", "#4477AA", "#DDCC77")
@@ -93,6 +105,23 @@ def figure(height: float, width: float = WIDTH) -> Iterator[Figure]:
     """
     with mpl.rc_context(fname=_STYLE):
         yield StyledFigure(figsize=(width, height), layout="constrained")
+
+
+def ask(drawn: Figure, question: str, detail: str = "") -> None:
+    """Write the question that a figure answers above it, and what one must know below it.
+
+    Args:
+        drawn: the figure.
+        question: a sentence that ends in a question mark.
+        detail: what was drawn, and what its marks mean.
+    """
+    points = 72 * drawn.get_figwidth()
+    # A letter is about six tenths as wide as it is high, and a bold one two thirds.
+    title = textwrap.fill(question, int(points / (0.67 * TITLE_SIZE)), break_long_words=False)
+    drawn.suptitle(title, x=0.01, ha="left", fontsize=TITLE_SIZE, fontweight="bold")
+    if detail:
+        text = textwrap.fill(detail, int(points / (0.58 * DETAIL_SIZE)), break_long_words=False)
+        drawn.supxlabel(text, x=0.01, ha="left", fontsize=DETAIL_SIZE, color=REFERENCE)
 
 
 def save(drawn: Figure, path: str | Path) -> Path:

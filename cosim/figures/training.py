@@ -19,8 +19,11 @@ from cosim.figures.style import (
     DASHED,
     ENTRIES,
     INK,
+    NARROW,
+    WIDTH,
     CostLine,
     EndLabel,
+    ask,
     cost_lines,
     figure,
     label_ends,
@@ -59,6 +62,7 @@ def training_figure(
     baselines: Mapping[str, float],
     *,
     title: str,
+    width: float = WIDTH,
 ) -> Figure:
     """Cost, violation, TD error and θ over a training's samples.
 
@@ -70,15 +74,18 @@ def training_figure(
             its name.
         baselines: J by controller on the greedy policy's noise; `optimal` is J*, and costs are then
             shown as regret (J − J*)/|J*|.
-        title: of the figure.
+        title: says which training it is, and how it ended.
+        width: in inches; panels of a narrow figure stand below each other.
     """
     panels = _training_panels(log, theta, baselines)
     # Four panels make a square; up to three a row.
     columns = len(panels) if len(panels) < 4 else 2
+    if width < NARROW:
+        columns = 1
     rows = -(-len(panels) // columns)
     # A training may have ended before its first sample.
     end = max(float(log["samples"][-1]), 1.0)
-    with figure(2.15 * rows + 0.35) as drawn:
+    with figure(2.0 * rows + 0.7, width) as drawn:
         grid = drawn.subplots(rows, columns, sharex=True, squeeze=False)
         labels = []
         for axes, (name, draw) in zip(grid.flat, panels.items(), strict=True):
@@ -87,7 +94,7 @@ def training_figure(
             samples_axis(axes, end)
         for axes in grid[-1]:
             axes.set_xlabel("training samples")
-        drawn.suptitle(plain(title))
+        ask(drawn, "Did the controller become better while it learned?", plain(title))
         label_ends(drawn, labels)
     return drawn
 
@@ -106,7 +113,7 @@ def _training_panels(
     """
     panels: dict[str, Panel] = {}
     best = baselines.get("optimal")
-    title_of_cost = "J per sample" if best is None else "regret %"
+    title_of_cost = "J per sample" if best is None else "regret %: cost above the least possible"
     panels[title_of_cost] = partial(
         _draw_cost,
         log=log,
@@ -115,7 +122,7 @@ def _training_panels(
     )
     samples, share = _known(log, "greedy_violating_share")
     if share.size:
-        panels["greedy: violating samples %"] = partial(
+        panels["samples that violate a bound, %, greedy"] = partial(
             _draw_course,
             samples=samples,
             values=100 * share,
@@ -125,7 +132,7 @@ def _training_panels(
     samples, error = _known(log, "td_error")
     # A single error makes no curve.
     if error.size > 1:
-        panels["TD error (r.m.s.)"] = partial(
+        panels["TD error, r.m.s.: how wrong Q is"] = partial(
             _draw_course,
             samples=samples,
             values=error,
@@ -134,7 +141,7 @@ def _training_panels(
         )
     moved = _most_moved(theta)
     if moved:
-        panels["change of θ, by its scale"] = partial(
+        panels["how far θ has moved, by its scale"] = partial(
             _draw_change,
             samples=log["samples"],
             moved=moved,
@@ -276,6 +283,7 @@ def parameters_figure(
         # A θ that never moved has no entries to name.
         if moving:
             _draw_entries_legend(drawn, most_entries)
+        ask(drawn, "How far has each block of θ moved, and does the TD error fall?")
     return drawn
 
 

@@ -23,8 +23,11 @@ from cosim.figures.style import (
     BOUND,
     DASHED,
     INK,
+    NARROW,
     REFERENCE,
+    WIDTH,
     LineStyle,
+    ask,
     figure,
     label,
     palette,
@@ -43,6 +46,7 @@ def trajectory_figure(
     scenario: Scenario,
     *,
     beside: Sequence[DrawnRun] = (),
+    width: float = WIDTH,
 ) -> Figure:
     """States and inputs with bounds (red) and operating point (grey), disturbances and costs.
 
@@ -54,6 +58,7 @@ def trajectory_figure(
         trajectory: the run.
         scenario: its scenario.
         beside: other runs that the axes span too, so that figures of a set can be compared.
+        width: in inches; panels of a narrow figure stand below each other.
     """
     scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
@@ -61,15 +66,18 @@ def trajectory_figure(
     # Left the states and inputs with their bounds, right what acts on the plant, and the costs.
     left = [*scenario.limits]
     right = [*scenario.plant.disturbances, *cost_colors]
-    # Panels on the right may be a little lower than those of the loop.
-    n_rows = max(len(left), len(right) * 0.8)
-    height = max(1.05 * n_rows, 2.4) + 0.5
-    with figure(height) as drawn:
-        panels = drawn.subplot_mosaic(
-            _mosaic(left, right),
-            sharex=True,
-            width_ratios=(1.35, 1.0),
-        )
+    if width < NARROW:
+        mosaic: list[Any] = [[name] for name in (*left, *right)]
+        ratios = [1.0]
+        n_rows = 0.8 * len(mosaic)
+    else:
+        mosaic = _mosaic(left, right)
+        ratios = [1.35, 1.0]
+        # Panels on the right may be a little lower than those of the loop.
+        n_rows = max(len(left), len(right) * 0.8)
+    height = max(1.05 * n_rows, 2.4) + 0.7
+    with figure(height, width) as drawn:
+        panels = drawn.subplot_mosaic(mosaic, sharex=True, width_ratios=ratios)
         for name, axes in panels.items():
             signal_unit = trajectory.signals[name].unit
             axes.set_ylabel(label(name, signal_unit), fontsize=7.0)
@@ -98,7 +106,11 @@ def trajectory_figure(
         # All panels share their abscissa.
         panels[left[0]].set_xlim(time[0], end)
         drawn.align_ylabels()
-        drawn.suptitle(_title(trajectory, scenario))
+        ask(
+            drawn,
+            "Does the loop keep its bounds, and what does it cost?",
+            _detail(trajectory, scenario),
+        )
     return drawn
 
 
@@ -216,18 +228,19 @@ def _draw_mean(axes: Axes, mean: float) -> None:
     )
 
 
-def _title(trajectory: DrawnRun, scenario: Scenario) -> str:
+def _detail(trajectory: DrawnRun, scenario: Scenario) -> str:
+    """The run and its costs in a line."""
     controller = shown_case(trajectory.controller or "run")
     seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
     summary = trajectory.summary()
     return (
-        f"{controller} on {plain(scenario.name)}{seed}:   "
-        f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
-        f"violating {100 * summary['violating_share']:.1f} % of samples"
+        f"{controller} on {plain(scenario.name)}{seed}: "
+        f"J = {summary['J']:.0f}, economic cost {summary['economic_cost']:.0f}, "
+        f"{100 * summary['violating_share']:.1f} % of samples violate a bound (red)"
     )
 
 
-def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
+def overlay_figure(runs: Mapping[str, DrawnRun], width: float = WIDTH) -> Figure:
     """States and inputs of runs of one scenario over time, a line for each controller.
 
     Below a violated lower bound, and above an upper one, the area is shaded in the controller's
@@ -238,7 +251,8 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
     scale, unit = time_unit(first.time)
     styles = palette(list(runs))
     n_panels = len(scenario.limits)
-    with figure(1.2 * n_panels + 0.6) as drawn:
+    is_narrow = width < NARROW
+    with figure(1.2 * n_panels + 1.0, width) as drawn:
         panels = _stacked_panels(drawn, n_panels)
         for axes, (name, bounds) in zip(panels, scenario.limits.items(), strict=True):
             for controller, run in runs.items():
@@ -256,7 +270,8 @@ def overlay_figure(runs: Mapping[str, DrawnRun]) -> Figure:
         panels[-1].set_xlim(begin / scale, end / scale)
         panels[-1].set_xlabel(f"time [{unit}]")
         drawn.align_ylabels()
-        _draw_costs_legend(panels[0], runs, styles)
+        _draw_costs_legend(panels[0], runs, styles, columns=1 if is_narrow else 2)
+        ask(drawn, "How do the controllers act against the same disturbances?")
     return drawn
 
 
@@ -270,6 +285,7 @@ def _draw_costs_legend(
     axes: Axes,
     runs: Mapping[str, DrawnRun],
     styles: Mapping[str, LineStyle],
+    columns: int,
 ) -> None:
     """Name each controller above the axes, with its J and the share of violating samples."""
     for controller, run in runs.items():
@@ -281,7 +297,7 @@ def _draw_costs_legend(
         # An empty line stands for the controller in the legend.
         axes.plot([], [], color=styles[controller].color, label=text)
     axes.plot([], [], color=BOUND, linestyle=DASHED, label="bound")
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.2)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=columns, borderaxespad=0.2)
 
 
 def animation(

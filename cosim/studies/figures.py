@@ -16,7 +16,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 from cosim.core.protocols import Array
 from cosim.core.statistics import regrets
 from cosim.figures import style
-from cosim.figures.style import DASHED, DotRow, EndLabel, LineStyle, palette, shown_case
+from cosim.figures.style import DASHED, WIDTH, DotRow, EndLabel, LineStyle, palette, shown_case
 from cosim.studies.measurements import StudyMeasurements
 from cosim.studies.operation_result import OperationResult
 from cosim.studies.operation_tables import OperationLayout
@@ -40,12 +40,13 @@ def _styles(study: StudyMeasurements) -> dict[str, LineStyle]:
 # Regrets of the runs
 
 
-def draw_regrets(study: StudyMeasurements, scenario: str) -> Figure | None:
+def draw_regrets(study: StudyMeasurements, scenario: str, width: float = WIDTH) -> Figure | None:
     """Regrets of all runs on a scenario; None where J* is unknown.
 
     Args:
         study: the measurements.
         scenario: its name.
+        width: in inches.
     """
     if study.reference("optimum", scenario) is None:
         return None
@@ -58,7 +59,7 @@ def draw_regrets(study: StudyMeasurements, scenario: str) -> Figure | None:
             rows.append(_regret_dots(study, row))
     if not rows:
         return None
-    return regret_figure(rows, _styles(study))
+    return regret_figure(rows, _styles(study), width)
 
 
 def _regret_dots(study: StudyMeasurements, row: Mapping[str, Any]) -> DotRow:
@@ -84,7 +85,11 @@ def _regret_dots(study: StudyMeasurements, row: Mapping[str, Any]) -> DotRow:
     )
 
 
-def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Figure:
+def regret_figure(
+    rows: Sequence[DotRow],
+    styles: Mapping[str, LineStyle],
+    width: float = WIDTH,
+) -> Figure:
     """A row for each case: its runs, their interquartile mean and its 95 % interval.
 
     A run that diverged is a cross; an interval that goes on to the left of the axes ends in an
@@ -93,9 +98,10 @@ def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Fi
     Args:
         rows: regrets of each case, in %.
         styles: line style of each case.
+        width: in inches.
     """
     rows = sorted(rows, key=lambda row: row.middle)
-    with style.figure(0.21 * len(rows) + 0.9) as drawn:
+    with style.figure(0.21 * len(rows) + 1.3, width) as drawn:
         axes = drawn.subplots()
         values = style.dot_rows(axes, rows, styles)
         upper_ends = [row.high for row in rows]
@@ -113,7 +119,12 @@ def regret_figure(rows: Sequence[DotRow], styles: Mapping[str, LineStyle]) -> Fi
             markersize=3,
             clip_on=False,
         )
-        axes.set_xlabel("regret % of runs (crosses diverged); interquartile mean, 95 % interval")
+        axes.set_xlabel("regret %: cost above the least possible")
+        style.ask(
+            drawn,
+            "How close does each case come to the best possible?",
+            "Dots: training runs; crosses: diverged. Bars: interquartile mean, 95 % interval.",
+        )
     return drawn
 
 
@@ -135,12 +146,13 @@ class LearningCurve:
     greedy: Array
 
 
-def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
+def draw_curves(study: StudyMeasurements, scenario: str, width: float = WIDTH) -> Figure | None:
     """Learning curves on a scenario; None if no training was evaluated more than once.
 
     Args:
         study: the measurements.
         scenario: its name.
+        width: in inches.
     """
     rows = study.curves[study.curves.scenario == scenario]
     # Rows of a controller are its cost on the noise of the curves.
@@ -164,7 +176,13 @@ def draw_curves(study: StudyMeasurements, scenario: str) -> Figure | None:
     for case, log in learned.groupby("case", sort=False):
         curves[str(case)] = learning_curve(log, best)
     is_relative = best is not None
-    return curves_figure(curves, levels.to_dict(), _styles(study), relative=is_relative)
+    return curves_figure(
+        curves,
+        levels.to_dict(),
+        _styles(study),
+        relative=is_relative,
+        width=width,
+    )
 
 
 def _optimal_cost(
@@ -260,6 +278,7 @@ def curves_figure(
     styles: Mapping[str, LineStyle],
     *,
     relative: bool,
+    width: float = WIDTH,
 ) -> Figure:
     """Above the cost of the training samples, below the greedy policy's.
 
@@ -271,9 +290,12 @@ def curves_figure(
         levels: costs that are drawn across all panels, by name.
         styles: line style of each case.
         relative: whether costs are regrets in %.
+        width: in inches; a narrow figure has one column.
     """
     unit = "regret %" if relative else "J"
     columns = _columns_by_start(curves)
+    if width < style.NARROW:
+        columns = {"": list(curves)}
     # As many names as lines and levels stand right of a panel.
     n_names = len(curves) + len(levels)
     height = max(2.6, 0.135 * n_names)
@@ -284,7 +306,7 @@ def curves_figure(
         "greedy policy": greedy,
     }
     end = max(float(curve.samples[-1]) for curve in curves.values())
-    with style.figure(2 * height + 0.4) as drawn:
+    with style.figure(2 * height + 0.8, width) as drawn:
         grid = drawn.subplots(
             2,
             len(columns),
@@ -313,6 +335,13 @@ def curves_figure(
             style.samples_axis(axes, end, "training samples")
         if len(columns) > 1:
             _draw_rules_legend(drawn)
+        most_curves = max(len(names) for names in columns.values())
+        bands = "; bands: their quartiles" if most_curves <= BANDED else ""
+        style.ask(
+            drawn,
+            "How many samples does each rule need, and what does learning cost?",
+            f"Lines: medians over the runs{bands}.",
+        )
         style.label_ends(drawn, labels)
     return drawn
 
@@ -409,12 +438,13 @@ def _draw_rules_legend(drawn: Figure) -> None:
 # Regret in operation
 
 
-def draw_operation(study: StudyMeasurements, scenario: str) -> Figure | None:
+def draw_operation(study: StudyMeasurements, scenario: str, width: float = WIDTH) -> Figure | None:
     """Regret in operation on a scenario; None where there is no course to draw.
 
     Args:
         study: the measurements.
         scenario: its name.
+        width: in inches.
     """
     if scenario not in study.scenarios_in_operation:
         return None
@@ -422,7 +452,7 @@ def draw_operation(study: StudyMeasurements, scenario: str) -> Figure | None:
     if result.runs.samples.nunique() == 1:
         return None
     layout = study.operation_layout(scenario)
-    return operation_figure(result, layout, _styles(study), study.baselines)
+    return operation_figure(result, layout, _styles(study), study.baselines, width)
 
 
 def operation_figure(
@@ -430,6 +460,7 @@ def operation_figure(
     layout: OperationLayout,
     styles: Mapping[str, LineStyle],
     baselines: Sequence[str],
+    width: float = WIDTH,
 ) -> Figure:
     """Greedy regret and regret of the whole run against the plant's samples, on log axes.
 
@@ -441,6 +472,7 @@ def operation_figure(
         layout: the plant's sampling time, and the cases that are drawn.
         styles: line style of each case.
         baselines: cases with a dashed line and no band.
+        width: in inches; panels of a narrow figure stand below each other.
     """
     runs = result.runs
     if layout.drawn:
@@ -448,13 +480,16 @@ def operation_figure(
     first = float(runs.samples.min())
     last = float(runs.samples.max())
     titles = {
-        "regret": "regret % of θ at that time",
-        "life_regret": "regret % of all samples so far",
+        "regret": "regret % of the θ learned so far",
+        "life_regret": "regret % of the whole run so far",
     }
     # Both panels have one ordinate, so that what learning costs can be seen.
     all_regrets = 100 * runs[list(titles)].to_numpy(dtype=np.float64)
-    with style.figure(3.4) as drawn:
-        panels = drawn.subplots(1, 2, sharey=True)
+    is_narrow = width < style.NARROW
+    shape = (2, 1) if is_narrow else (1, 2)
+    with style.figure(3.1 * shape[0] + 0.7, width) as drawn:
+        panels = drawn.subplots(*shape, sharey=True)
+        ends = []
         for axes, (column, title) in zip(panels, titles.items(), strict=True):
             labels = _draw_regret_courses(axes, runs, column, styles, baselines)
             axes.set_xscale("log")
@@ -466,8 +501,15 @@ def operation_figure(
             _mark_times(axes, layout.sampling_time, first, last)
             axes.set_title(title, pad=12)
             axes.set_xlabel("samples of the plant")
-        # The panels share their ordinate: names stand right of the last one.
-        style.label_ends(drawn, [(panels[-1], labels)])
+            # Panels beside each other share their ordinate: names stand right of the last one.
+            if is_narrow or axes is panels[-1]:
+                ends.append((axes, labels))
+        style.ask(
+            drawn,
+            "How good is each controller by then, and what has it cost to get there?",
+            "Lines: medians over the training seeds; bands: the best to the worst run.",
+        )
+        style.label_ends(drawn, ends)
     return drawn
 
 
@@ -559,7 +601,7 @@ def _mark_times(axes: Axes, sampling_time: float, first: float, last: float) -> 
         )
 
 
-STUDY_FIGURES: dict[str, Callable[[StudyMeasurements, str], Figure | None]] = {
+STUDY_FIGURES: dict[str, Callable[[StudyMeasurements, str, float], Figure | None]] = {
     "curves": draw_curves,
     "regret": draw_regrets,
     "operation": draw_operation,

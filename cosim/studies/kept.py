@@ -83,7 +83,7 @@ def _trajectory_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figur
                     for case, drawn in _single_figures(trajectories, scenario):
                         yield f"{stem}-{folder_name(case)}", drawn
                 elif kind == "overlay":
-                    yield stem, overlay_figure(trajectories)
+                    yield stem, overlay_figure(trajectories, style.SCREEN)
                 elif kind == "density":
                     yield stem, density_figure(trajectories, scenario)
                 else:
@@ -99,7 +99,7 @@ def _single_figures(
     # Their axes span all runs, so that the figures can be compared.
     beside = list(trajectories.values())
     for case, trajectory in trajectories.items():
-        yield case, trajectory_figure(trajectory, scenario, beside=beside)
+        yield case, trajectory_figure(trajectory, scenario, beside=beside, width=style.SCREEN)
 
 
 def _runs_with(file: str, scenario: str, plan: StudyPlan, out: Path) -> dict[str, Run]:

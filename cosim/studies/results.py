@@ -20,7 +20,7 @@ from cosim.core.result import Shown, TextTable, markdown_table
 from cosim.core.simulation import reporting
 from cosim.core.validation import instead
 from cosim.evaluation import TIMING, Progress
-from cosim.figures.style import FORMATS, save_set
+from cosim.figures.style import FORMATS, SCREEN, WIDTH, save_set
 from cosim.studies.definition import Study
 from cosim.studies.figures import STUDY_FIGURES
 from cosim.studies.kept import draw_kept, keep_files
@@ -124,24 +124,28 @@ class StudyResults(StudyMeasurements, Shown):
         """Title, header and rows: gains over the paper's two baselines, of each trained case."""
         return paper_table(self)
 
-    def figure(self, name: str | None = None) -> Figure:
+    def figure(self, name: str | None = None, width: float = WIDTH) -> Figure:
         """Draw `curves`, `regret` or `operation` of a scenario, as `curves-paper`.
 
-        None is the first scenario's regret. Raises StudyError for another name, and where there is
-        nothing to draw.
+        Args:
+            name: of the figure; None is the first scenario's regret.
+            width: in inches; `cosim.figures.style` has that of one and of two columns of a journal.
+
+        Raises:
+            StudyError: there is no such figure, or nothing to draw in it.
         """
         if name is None:
             name = f"regret-{self.scenarios[0]}"
-        names = []
+        drawn = {}
         for scenario, kind in product(self.scenarios, STUDY_FIGURES):
-            names.append(f"{kind}-{scenario}")
-        drawn = None
-        if name in names:
-            kind, _, scenario = name.partition("-")
-            drawn = STUDY_FIGURES[kind](self, scenario)
-        if drawn is None:
-            raise StudyError(f"this study draws no figure '{name}'{instead(name, names)}")
-        return drawn
+            drawn[f"{kind}-{scenario}"] = (STUDY_FIGURES[kind], scenario)
+        if name in drawn:
+            draw, scenario = drawn[name]
+            figure = draw(self, scenario, width)
+            if figure is not None:
+                return figure
+            raise StudyError(f"'{name}': the study's tables have nothing to draw in this figure")
+        raise StudyError(f"this study draws no figure '{name}'{instead(name, drawn)}")
 
     def draw(self, folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, list[str]]:
         """Draw the figures of the tables.
@@ -157,7 +161,7 @@ class StudyResults(StudyMeasurements, Shown):
         for scenario in self.scenarios:
             drawn = []
             for kind, draw in STUDY_FIGURES.items():
-                figure = draw(self, scenario)
+                figure = draw(self, scenario, SCREEN)
                 # Without J*, or a training, there may be nothing to draw.
                 if figure is not None:
                     drawn.append((f"{kind}-{folder_name(scenario)}", figure))

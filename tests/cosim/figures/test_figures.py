@@ -102,7 +102,9 @@ def panels(figure):
 
 
 def test_costs_are_shown_as_regret_where_the_optimum_is_known():
-    axes = panels(training_figure(LOG, THETA, BASELINES, title="t"))["regret %"]
+    axes = panels(training_figure(LOG, THETA, BASELINES, title="t"))[
+        "regret %: cost above the least possible"
+    ]
     training, greedy = axes.lines[:2]
     assert np.allclose(training.get_ydata(), [200.0, 100.0, 50.0, 20.0])
     assert np.allclose(greedy.get_xdata(), [0.0, 2000.0, 4000.0])

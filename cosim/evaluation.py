@@ -21,7 +21,7 @@ from cosim.core.files import staged
 from cosim.core.plugins import ControllerSource, build_controller, parameters_hash
 from cosim.core.processes import holding
 from cosim.core.protocols import Array, Decision
-from cosim.core.result import Result, markdown_table
+from cosim.core.result import Result, text_table
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import indicators, measure, reporting, simulate
 from cosim.core.validation import instead, whole_number
@@ -57,6 +57,18 @@ Progress = Callable[[int, str, str], None]
 
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
 COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
+TABLE_TITLES = {
+    "controller": "controller",
+    "regret": "regret %",
+    "J": "J",
+    "economic_cost": "economic cost",
+    "violating": "violating %",
+    "failures": "failures",
+    "mean_violation": "mean violation",
+    "input_effort": "input effort",
+}
+"""Titles of the columns of a printed table, by the names that `Evaluation.table` takes."""
+TABLE_COLUMNS = ("controller", "regret", "J", "economic_cost", "violating", "failures")
 EVALUATION_COLUMNS = [
     "controller", "scenario", "seed", "steps", "economic_cost", "mean_violation",
     "violating_share", "J", "regret", "gap_closed", "gain_in_J", "input_effort", "failures",
@@ -460,14 +472,57 @@ class Evaluation(Result):
             width=width or WIDTH,
         )
 
-    def table(self) -> str:
-        """Means over the seeds by controller, as a Markdown table; a regret of 1 is 100 %."""
-        names = ["J", "regret", "economic_cost", "violating_share", "failures"]
-        by_controller = self.to_pandas().groupby("controller", sort=False)
-        means = by_controller[names].mean()
-        texts = means.map("{:.6g}".format)
-        rows = texts.reset_index().to_numpy().tolist()
-        return markdown_table(("controller", *names), rows)
+    def table(
+        self,
+        columns: Sequence[str] = TABLE_COLUMNS,
+        *,
+        format: str = "markdown",
+    ) -> str:
+        """A row for each controller, its means over the seeds.
+
+        Args:
+            columns: keys of `TABLE_TITLES`.
+            format: markdown, latex or html.
+
+        Raises:
+            EvaluationError: there is no such column.
+            CosimError: there is no such format.
+        """
+        for column in columns:
+            if column not in TABLE_TITLES:
+                raise EvaluationError(
+                    f"a table has no column '{column}'{instead(column, TABLE_TITLES)}"
+                )
+        rows = []
+        for name in self.controllers:
+            cells = self._cells(name)
+            rows.append([cells[column] for column in columns])
+        header = [TABLE_TITLES[column] for column in columns]
+        return text_table(header, rows, format)
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def _cells(self, name: str) -> dict[str, str]:
+        """Texts of a controller's row, by the keys of `TABLE_TITLES`."""
+        cells = {
+            "controller": name,
+            "regret": "",
+            "J": statistics.shown(float(self.column(name, "J").mean()), digits=6),
+            "failures": str(int(self.column(name, "failures").sum())),
+        }
+        for column, places in (("economic_cost", 2), ("mean_violation", 5), ("input_effort", 5)):
+            cells[column] = f"{self.column(name, column).mean():.{places}f}"
+        cells["violating"] = f"{100 * self.column(name, 'violating_share').mean():.2f}"
+        if self.optimum is None:
+            return cells
+        cost = self._cost(name)
+        estimate = statistics.regret(cost, self.optimal)
+        size = statistics.magnitude(self.optimal)
+        # The cost of rare violations is skewed, which Student's interval does not know.
+        interval = statistics.bootstrapped(cost - self.optimal, size) or estimate.interval
+        cells["regret"] = statistics.shown_estimate(estimate.value, interval, 100.0)
+        return cells
 
     def write(self, folder: str | Path) -> None:
         """Write evaluation.csv, evaluation.png, timing.csv and scenario.toml, all or none."""

@@ -203,12 +203,10 @@ def _show_pairs(summary: dict[str, Any], output: cli.Output) -> None:
 
 def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:
     """An estimate of a summary with its interval; empty where it is undefined."""
-    from cosim.core.statistics import shown
+    from cosim.core.statistics import shown_estimate
 
     if estimate is None or not isfinite(estimate["value"]):
         return ""
     # The cost of rare violations is skewed: the bootstrap's interval holds no impossible regret.
     interval = estimate.get("bootstrap") or estimate["interval"]
-    # The interval's width says how many digits of the value mean anything.
-    digits = 3 if interval is None else 1
-    return shown(estimate["value"], interval, scale, digits)
+    return shown_estimate(estimate["value"], interval, scale)

@@ -190,6 +190,7 @@ def reproduce(
         budget: quick: minutes on 2 cores; full: hours, with more seeds and samples.
     """
     with cli.output(json) as out_:
+        from cosim.studies.paper_claim import paper_verdict
         from cosim.studies.stored import stored_results
 
         name = "reproduce" if budget == "quick" else "reproduce-full"
@@ -200,7 +201,10 @@ def reproduce(
         title, header, rows = results.paper()
         out_.table(title, header, rows)
         out_.note(f"the report is {page.resolve()}")
-        summary = _summary(results)
+        claim = paper_verdict(results)
+        for name, text in claim.items():
+            out_.note(f"{name:<8} {text}")
+        summary = _summary(results) | {"claim": claim}
         cli.write_summary(results.folder, summary)
         out_.json(summary)
 

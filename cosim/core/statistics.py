@@ -400,6 +400,18 @@ def shown(
     return f"{value:.{places}f} [{low:.{places}f}, {high:.{places}f}]"
 
 
+def shown_estimate(value: float, ends: Interval, scale: float = 1.0) -> str:
+    """`shown` with as many digits as the interval says mean anything; three without one.
+
+    Args:
+        value: what is shown.
+        ends: of its interval.
+        scale: factor of all three numbers.
+    """
+    digits = 3 if ends is None else 1
+    return shown(value, ends, scale, digits)
+
+
 def decimals(value: float, digits: int) -> int:
     """Decimals, 0 to 9, with which a number shows so many significant digits.
 

@@ -18,6 +18,7 @@ from cosim.core.result import markdown_table
 from cosim.evaluation import TIMING
 from cosim.studies.measurements import StudyMeasurements
 from cosim.studies.report_tables import (
+    SHORT_COLUMNS,
     TitledRows,
     aggregate_table,
     cases_table,
@@ -97,12 +98,14 @@ class Section:
     Attributes:
         title: its heading.
         table: header and rows.
+        short: some columns of it, which the page shows first; None: it shows all.
         figures: names of figures.
         note: a paragraph above the table.
     """
 
     title: str
     table: TitledRows | None = None
+    short: TitledRows | None = None
     figures: Sequence[str] = ()
     note: str = ""
 
@@ -114,6 +117,7 @@ def _sections(study: StudyMeasurements, figures: Mapping[str, Sequence[str]]) ->
         section = Section(
             title=f"Scenario {scenario}",
             table=scenario_table(study, scenario),
+            short=scenario_table(study, scenario, SHORT_COLUMNS),
             figures=figures[scenario],
             note=_noise_note(study, scenario),
         )

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from cosim.core import statistics
 from cosim.core.errors import StudyError
-from cosim.core.protocols import Array
 from cosim.core.result import TextTable
 from cosim.core.statistics import shown
 from cosim.core.validation import instead
 from cosim.studies.case_runs import columns_of
 from cosim.studies.measurements import StudyMeasurements
 from cosim.studies.operation_tables import operation_tables
+from cosim.studies.paper_claim import paper_table
 
 TitledRows = tuple[Sequence[str], list[list[str]]]
 """Header of a table and its rows of texts."""
@@ -43,15 +41,10 @@ REPORT_COLUMNS = {
     "p": "p",
 }
 """Titles of the columns of a scenario's table, by the names that options take."""
-SHORT_COLUMNS = ("case", "rank", "regret", "worst", "finished")
-"""Columns that fit a terminal of 80 characters."""
+SHORT_COLUMNS = ("case", "rank", "regret", "worst", "violating", "finished")
+"""Columns that a table has where nobody names others."""
 DIFFERENCE_COLUMNS = ("against", "difference", "p")
 """Columns of the paired difference from a case's counterpart."""
-
-PAPER = {"naive": 21.0, "tuned": 15.0}
-"""Gain of the paper's RL-tuned RTI-NMPC over (a) and (b), in per cent."""
-NEAR = 3.0
-"""Per cent within which a gain agrees with the paper's, which are approximate."""
 
 
 def scenario_table(
@@ -127,10 +120,10 @@ def _summary_cells(row: Mapping[str, Any]) -> dict[str, str]:
         "regret": _percent(row, "regret_median", interval="regret_shown"),
         "worst": _percent(row, "regret_worst"),
         "iqm": _percent(row, "regret_iqm"),
-        "J": _shown_number(row["J_median"]),
-        "J-worst": _shown_number(row["J_worst"]),
+        "J": shown_number(row["J_median"]),
+        "J-worst": shown_number(row["J_worst"]),
         "gap": _percent(row, "gap_closed_median", digits=4),
-        "economic": _shown_number(row["economic_cost"]),
+        "economic": shown_number(row["economic_cost"]),
         "violation": f"{row['mean_violation']:.5f}",
         "violating": f"{100 * row['violating_share']:.2f}",
         "week": _estimate(row, "violations_week"),
@@ -198,7 +191,7 @@ def runs_table(study: StudyMeasurements) -> TitledRows:
                 row["status"],
                 str(row["plant_samples"] or ""),
                 _percent(row, "regret"),
-                _shown_number(row["J"]),
+                shown_number(row["J"]),
             ]
         )
     return header, rows
@@ -217,74 +210,6 @@ def further_tables(study: StudyMeasurements) -> Iterator[TextTable]:
         )
     if "paper" in study.about["tables"]:
         yield paper_table(study)
-
-
-def paper_table(study: StudyMeasurements) -> TextTable:
-    """Title, header and rows: gains of each trained case's median run on every scenario.
-
-    The paper's two gains imply J(b)/J(a) = (1 − 0.21)/(1 − 0.15) = 0.93.
-    """
-    trained = [name for name, case in study.cases.items() if case["trained"]]
-    rows = []
-    for scenario, case in product(study.scenarios, trained):
-        indicators = study.indicators.get((scenario, case))
-        naive = study.indicators.get((scenario, "naive"))
-        tuned = study.indicators.get((scenario, "tuned"))
-        # A case, or a baseline, may not run on this scenario.
-        if indicators is None or naive is None or tuned is None:
-            continue
-        gains = _gains_over_baselines(indicators, naive, tuned)
-        rows.append([scenario, case, *gains])
-    title = (
-        "Gains over the baselines: the paper's text states about 21 % over (a) and 15 % over (b)"
-    )
-    header = (
-        "scenario",
-        "case",
-        "J(b)/J(a)",
-        "J, median",
-        "gain over (a) %",
-        "gain over (b) %",
-        "economic over (a) %",
-        "economic over (b) %",
-        "agrees with the paper on",
-    )
-    return title, header, rows
-
-
-def _gains_over_baselines(
-    indicators: Mapping[str, Array],
-    naive: Mapping[str, Array],
-    tuned: Mapping[str, Array],
-) -> list[str]:
-    """Cells of the paper's table: what a case's median run gains over (a) and (b).
-
-    Args:
-        indicators: of the case, (R, S) each.
-        naive: indicators of the controller (a), (1, S) each.
-        tuned: indicators of the controller (b), (1, S) each.
-    """
-    cost = indicators["J"].mean(axis=1)
-    by_cost = np.argsort(cost, kind="stable")
-    # Of an even number the lower one of both middle runs.
-    median_run = by_cost[(len(cost) - 1) // 2]
-    ratio = tuned["J"].mean() / naive["J"].mean()
-    cells = [f"{ratio:.3f}", _shown_number(cost[median_run])]
-    baselines = (
-        ("(a)", naive, PAPER["naive"]),
-        ("(b)", tuned, PAPER["tuned"]),
-    )
-    agrees = []
-    for name in ("J", "economic_cost"):
-        values = indicators[name][median_run]
-        for letter, baseline, papers_gain in baselines:
-            # A controller has one run.
-            gain = statistics.gain(values, baseline[name][0])
-            cells.append(shown(gain.value, gain.interval, scale=100.0, digits=3))
-            # The paper's gains are in J.
-            if name == "J" and abs(100 * gain.value - papers_gain) <= NEAR:
-                agrees.append(letter)
-    return [*cells, " and ".join(agrees)]
 
 
 def _percent(row: Mapping[str, Any], name: str, *, interval: str = "", digits: int = 3) -> str:
@@ -319,5 +244,6 @@ def _estimate(
     return shown(value, ends, scale, digits)
 
 
-def _shown_number(value: float) -> str:
+def shown_number(value: float) -> str:
+    """A cost with six digits."""
     return shown(float(value), digits=6)

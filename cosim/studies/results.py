@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from cosim.core.errors import FailedRunsError, StudyError
 from cosim.core.files import staged
 from cosim.core.processes import holding
-from cosim.core.result import Shown, TextTable, markdown_table
+from cosim.core.result import Shown, TextTable, text_table
 from cosim.core.simulation import reporting
 from cosim.core.validation import instead
 from cosim.evaluation import TIMING, Progress
@@ -25,13 +25,13 @@ from cosim.studies.definition import Study
 from cosim.studies.figures import STUDY_FIGURES
 from cosim.studies.kept import draw_kept, keep_files
 from cosim.studies.measurements import StudyMeasurements
+from cosim.studies.paper_claim import paper_table
 from cosim.studies.plan import StudyPlan, plan
 from cosim.studies.report import FOLDER, write_report
 from cosim.studies.report_tables import (
     SHORT_COLUMNS,
     TitledRows,
     further_tables,
-    paper_table,
     scenario_table,
 )
 from cosim.studies.run import GREEDY, Runner, RunStore, folder_name, frame_csv
@@ -110,11 +110,36 @@ class StudyResults(StudyMeasurements, Shown):
         """
         return scenario_table(self, scenario, columns)
 
-    def table(self, scenario: str | None = None) -> str:
-        """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
-        if scenario is not None:
-            return markdown_table(*self.lines(scenario))
-        return "\n".join(f"{name}\n\n{self.table(name)}" for name in self.scenarios)
+    def table(
+        self,
+        scenario: str | None = None,
+        columns: Sequence[str] | None = SHORT_COLUMNS,
+        *,
+        format: str = "markdown",
+    ) -> str:
+        """A scenario's table, lowest J first.
+
+        Args:
+            scenario: its name; None: the tables of all scenarios, each below its name.
+            columns: names as `cosim study report --columns` takes them; None: all of which
+                something is known.
+            format: markdown, latex or html.
+
+        Raises:
+            StudyError: there is no such scenario or column.
+            CosimError: there is no such format.
+        """
+        if scenario is None:
+            tables = []
+            for name in self.scenarios:
+                tables.append(f"{name}\n\n{self.table(name, columns, format=format)}")
+            return "\n".join(tables)
+        if scenario not in self.scenarios:
+            raise StudyError(
+                f"the study has no scenario '{scenario}'{instead(scenario, self.scenarios)}"
+            )
+        header, rows = self.lines(scenario, columns)
+        return text_table(header, rows, format)
 
     def further_tables(self) -> Iterator[TextTable]:
         """Title, header and rows of the tables that the study asks for beside its summary."""

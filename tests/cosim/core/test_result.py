@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import cosim
+from cosim.core.errors import CosimError
+from cosim.core.result import text_table
 
 
 @pytest.fixture(scope="module")
@@ -70,3 +72,16 @@ def test_frames_hold_the_values(run, training):
     np.testing.assert_array_equal(
         training.parameters.to_pandas()["theta"], training.parameters.theta
     )
+
+
+def test_a_table_has_the_format_of_the_paper_that_it_goes_to():
+    header = ("case", "regret %")
+    rows = [("a_b & c", "1 [0, 2]"), ("[d]", "3\\4")]
+    assert text_table(header, rows, "markdown").splitlines()[1] == "| --- | ---: |"
+    latex = text_table(header, rows, "latex").splitlines()
+    assert latex[0] == r"\begin{tabular}{lr}"
+    assert latex[2:5] == [r"case & regret \% \\", r"\midrule", r"a\_b \& c & 1 [0, 2] \\"]
+    assert latex[5] == r"{}[d] & 3\textbackslash{}4 \\"
+    assert "<td>a_b &amp; c</td>" in text_table(header, rows, "html")
+    with pytest.raises(CosimError, match=r"'latx' \(did you mean 'latex'"):
+        text_table(header, rows, "latx")

@@ -242,6 +242,11 @@ def test_the_reproduction_is_a_study_with_the_paper_s_table_and_figure(tmp_path,
     assert result.exit_code == 0, result.output + repr(result.exception)
     report = (out / "report.md").read_text()
     assert "| cheap | q |" in report
+    # It ends with the answer: too short a study reproduces nothing.
+    claim, found, verdict = result.output.strip().splitlines()[-3:]
+    assert claim.startswith("claim") and "21 %" in claim
+    assert found.startswith("found") and "q on " in found
+    assert verdict.startswith("verdict") and "not reproduced: none is within 3 %" in verdict
     for name in ("parameters-paper-q", "parameters-cheap-q"):
         assert (out / "figures" / f"{name}.png").stat().st_size > 10_000
         assert f'alt="{name}"' in (out / "report.html").read_text()

@@ -12,6 +12,8 @@ from cosim.recording.read import TIMELINE
 from cosim.recording.stream import Channel, drawable
 
 AT = rr.TimeRangeBoundary.absolute
+OPENING = 4
+"""Plots that a recording opens on; all others are in further tabs."""
 
 
 def axis(start: rr.TimeRangeBoundary, end: rr.TimeRangeBoundary) -> rrb.TimeAxis:
@@ -95,13 +97,14 @@ def tabs(
     """A layout of a tab for each title that has views, and one of the page about the recording.
 
     Args:
-        views_of: views by title, which a tab has in a grid.
+        views_of: views by title, which a tab has in a grid; the recording opens on the first.
         timeline: that of the time panel.
     """
     grids = []
     for name, views in views_of.items():
         if views:
-            grids.append(rrb.Grid(*views, grid_columns=3, name=name))
+            columns = 2 if len(views) <= OPENING else 3
+            grids.append(rrb.Grid(*views, grid_columns=columns, name=name))
     page = rrb.TextDocumentView(name="about", origin="/about")
     return layout(rrb.Tabs(*grids, page), timeline)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from rerun import escape_entity_path_part as escaped
 
 from cosim.core.protocols import Array
 from cosim.core.trajectory import RunSignals
-from cosim.recording.layout import AT, axis, tabs, view
+from cosim.recording.layout import AT, OPENING, axis, tabs, view
 from cosim.recording.stream import FREE, SERIES, Channel, Stream, times
 
 
@@ -49,8 +49,10 @@ def record_overlay(
     title = " / ".join(runs)
     overlaid = []
     differences = []
+    common = _common_signals(runs)
+    opening = _opening_signals(common, first)
     with Stream(path, title, about) as stream:
-        for signal in _common_signals(runs):
+        for signal in common:
             lines = _overlaid_lines(runs, signal)
             for line, run in zip(lines, runs.values(), strict=True):
                 values = run.signals[signal].values
@@ -58,15 +60,27 @@ def record_overlay(
                 stream.send([line], rows, values, ends)
             # The title has the unit and the bounds, but no run's name.
             titled = replace(lines[0], name=signal)
-            plot = view(titled.title, lines, along)
-            overlaid.append(plot)
+            # One legend names the runs: more of them would cover the lines.
+            plot = view(titled.title, lines, along, legend=signal == opening[0])
+            overlaid.append((signal, plot))
             # A difference of more than two runs would need one to compare with.
             if len(runs) == 2:
                 line = _send_difference(stream, first, others[0], signal)
                 plot = view(line.title, [line], along)
                 differences.append(plot)
-        views_of = {title: overlaid, "difference": differences}
+        views_of = {
+            title: [plot for signal, plot in overlaid if signal in opening],
+            "all signals": [plot for signal, plot in overlaid if signal not in opening],
+            "difference": differences,
+        }
         stream.layout = tabs(views_of)
+
+
+def _opening_signals(names: Sequence[str], run: RunSignals) -> list[str]:
+    """The signals that the recording opens on: those with bounds in a run, else the first ones."""
+    bounded = [name for name in names if name in run.bounds]
+    others = [name for name in names if name not in run.bounds]
+    return [*bounded, *others][:OPENING]
 
 
 def _common_signals(runs: Mapping[str, RunSignals]) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun.blueprint as rrb
 from rerun import escape_entity_path_part as escaped
 
 from cosim.recording.layout import AT, axis, properties_table, tabs, view
@@ -15,6 +16,9 @@ from cosim.recording.stream import SERIES, Channel, Stream, times
 
 if TYPE_CHECKING:
     from learning.training import Training
+
+OPENING_COLUMNS = ("J", "greedy_J", "greedy_violating_share", "td_error")
+"""Columns of the log that the recording opens on."""
 
 
 def record_training(path: str | Path, training: Training) -> None:
@@ -49,8 +53,9 @@ def record_training(path: str | Path, training: Training) -> None:
     title = f"{run.algorithm} on {run.scenario.name}"
     page = f"# {title}\n\n{properties_table('training', properties)}"
     blocks = training.parameters.blocks
-    theta_views = []
-    log_views = []
+    theta_views: list[rrb.View] = []
+    opening_views: list[rrb.View] = []
+    log_views: list[rrb.View] = []
     with Stream(path, title, page, properties) as stream:
         for name, values in training.theta().items():
             labels = blocks.labels[blocks.slices[name]]
@@ -71,5 +76,7 @@ def record_training(path: str | Path, training: Training) -> None:
                 points=sparse,
             )
             stream.send([column], rows, values)
-            log_views.append(view(name, [column], along))
-        stream.layout = tabs({"θ": theta_views, "log": log_views}, SAMPLE)
+            views = opening_views if name in OPENING_COLUMNS else log_views
+            views.append(view(name, [column], along))
+        views_of = {"learning": opening_views, "log": log_views, "θ": theta_views}
+        stream.layout = tabs(views_of, SAMPLE)

@@ -18,7 +18,7 @@ from cosim.core.loop import controller_name
 from cosim.core.protocols import Array, Controller
 from cosim.core.scenario import Scenario
 from cosim.core.trajectory import SIGNALS, SignalKind
-from cosim.recording.layout import AT, axis, layout, properties_table, view
+from cosim.recording.layout import AT, OPENING, axis, properties_table, tabs, view
 from cosim.recording.stream import FREE, SERIES, Channel, Stream, drawable, packed_color, times
 
 ALONE = ("states", "actions", "sensors", "costs")
@@ -278,18 +278,34 @@ class RerunRecorder:
         return selected
 
     def _layout(self) -> rrb.Blueprint:
-        """Left: states and actions with bounds; middle: costs, causes, solver; right: the rest."""
+        """Four plots of the loop; in further tabs the others, the predictions, and the page."""
         along = axis(AT(seconds=0.0), AT(seconds=self._seconds))
-        left = [self._loop_view(channel, along) for channel in self._group("states", "actions")]
-        columns = rrb.Horizontal(
-            rrb.Vertical(*left),
-            rrb.Vertical(*self._middle_views(along)),
-            self._right_column(along),
-            column_shares=[4, 3, 3],
-        )
-        return layout(columns)
+        opening = self._opening_channels()
+        others: list[rrb.View] = []
+        for channel in self._group("states", "actions"):
+            if channel not in opening:
+                others.append(self._loop_view(channel, along))
+        predictions: list[rrb.View] = []
+        for channel in chain(*self._predicted.values()):
+            if channel.window():
+                predictions.append(view(channel.title, [channel], along, legend=False))
+        views_of: dict[str, list[rrb.View]] = {
+            "loop": [self._loop_view(channel, along) for channel in opening],
+            "other states and inputs": others,
+            "costs, disturbances, solver": self._further_views(along),
+            "predictions": predictions,
+        }
+        return tabs(views_of)
 
-    def _middle_views(self, along: rrb.TimeAxis) -> list[rrb.View]:
+    def _opening_channels(self) -> list[Channel]:
+        """What the recording opens on: two states and two inputs, or more of the others."""
+        states = self._group("states")
+        actions = self._group("actions")
+        n_states = max(2, OPENING - len(actions))
+        shown_states = states[:n_states]
+        return shown_states + actions[: OPENING - len(shown_states)]
+
+    def _further_views(self, along: rrb.TimeAxis) -> list[rrb.View]:
         """The plots of costs, of what acts on the plant, and of the solver."""
         views: list[rrb.View] = []
         for sensor in self._group("sensors"):
@@ -327,17 +343,6 @@ class RerunRecorder:
             if sensor.name in known or is_its_bound:
                 drawn.append(sensor)
         return view(channel.title, drawn, along)
-
-    def _right_column(self, along: rrb.TimeAxis) -> rrb.TextDocumentView | rrb.Tabs:
-        """The page about the run, behind the predictions where there are any."""
-        page = rrb.TextDocumentView(name="about this run", origin="/about")
-        predictions = []
-        for channel in chain(*self._predicted.values()):
-            if channel.window():
-                predictions.append(view(channel.title, [channel], along, legend=False))
-        if not predictions:
-            return page
-        return rrb.Tabs(rrb.Vertical(*predictions, name="predictions"), page)
 
 
 def _channels(

@@ -40,10 +40,10 @@ def regrets(study, kind="greedy"):
         key = row["scenario"], row["case"], int(row["samples"])
         costs[key, row["training_seed"]].append(float(row["J"]))
     result = defaultdict(list)
+    known = {key for key, _ in costs}
     for (key, seed), values in costs.items():
         scenario, case, samples = key
-        has_optimum = (scenario, "optimal", samples) in {key for key, _ in costs}
-        if case == "optimal" or not has_optimum:
+        if case == "optimal" or (scenario, "optimal", samples) not in known:
             continue
         # Greedy runs share their noise; a run in operation has the noise of its training seed.
         optimum = costs[(scenario, "optimal", samples), "" if kind == "greedy" else seed]

@@ -23,22 +23,15 @@ FENCE = re.compile(r"^```(\w*)[ ]*([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTAL
 TITLE = re.compile(r'title="([^"]+)"')
 # Not typed by a test of its page, because another check does it or a person has to be there.
 COVERED = {
-    "make demo": "the Makefile's target; `make check` runs its command on a small budget",
     "cosim demo --out demo": "minutes; `make check` runs it on a small budget",
-    "cosim demo --samples 4000 --steps 100 --out first-look": "tests/cosim/test_cli.py",
-    "make test": "the target is run by .ci/run",
-    "python3 -m venv .venv": "tests/packaging installs into an empty environment",
-    ". .venv/bin/activate": "tests/packaging installs into an empty environment",
     "git clone REPOSITORY rti-cosim && cd rti-cosim": "no public address is known",
     "python3 -m venv .venv && . .venv/bin/activate": (
         "tests/packaging installs into an empty environment"
     ),
-    "pip install .": "tests/packaging installs the wheel into an empty environment",
     "pip install -c constraints.txt '.[view]'": (
         "tests/packaging installs the wheel into an empty environment"
     ),
-    "pip install '.[cluster]'": "installed by `make test`",
-    "cosim view demo/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
+    "cosim view before/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim view run/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim optimum --scenario paper": "minutes; tests/cosim/cli/test_optimum.py",
     "cosim reproduce --budget quick": "minutes; tests/cosim/studies/test_stored.py",
@@ -55,7 +48,7 @@ COVERED = {
 # done and feeds the next one. What comes out of a whole budget has its own tests.
 SMALLER = {
     "naive,tuned,optimal,": "naive,tuned,",
-    "naive,backed-off,learnt": "naive,learnt",
+    "naive,cautious,learned": "naive,learned",
     "--seeds 20 --steps 1000": "--seeds 2 --steps 100",
     "--seeds 3 --steps 1000": "--seeds 2 --steps 200",
     "--seeds 4 --steps 500": "--seeds 2 --steps 300",

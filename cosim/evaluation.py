@@ -36,10 +36,11 @@ NAIVE = "naive"
 OPTIMAL = "optimal"
 EVALUATION = "evaluation.csv"
 TIMING = "timing.csv"
+PICTURE = "evaluation.png"
 EVALUATION_FILES = (
     EVALUATION,
     TIMING,
-    "evaluation.png",
+    PICTURE,
     "scenario.toml",
     "summary.json",
     "judged.csv",
@@ -531,7 +532,11 @@ class Evaluation(Result):
 
     def write_files(self, folder: Path) -> None:
         """Write the files of `write` one after the other."""
-        self.plot(folder / "evaluation.png")
+        self.plot(folder / PICTURE)
+        self.write_tables(folder)
+
+    def write_tables(self, folder: Path) -> None:
+        """Write the files of `write` but the picture, which takes a second."""
         (folder / "scenario.toml").write_text(self.scenario.to_toml(), "utf-8")
         # Times of a clock have no more digits that mean anything.
         timing = self._rows(self.timing).round(3)

@@ -12,6 +12,7 @@ import typer
 
 import cosim
 from cosim.cli import output as cli
+from cosim.core.errors import CosimError
 from cosim.core.files import staged, write_atomically
 
 PairsOption = Annotated[
@@ -30,12 +31,13 @@ def evaluate(
     pairs: PairsOption = False,
     jobs: cli.JobsOption = None,
     scheduler: cli.SchedulerOption = None,
+    plot: Annotated[bool, typer.Option("--plot")] = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Compare controllers on the same disturbances, seed by seed.
 
-    Writes evaluation.csv (a row per controller and seed), evaluation.png, summary.json, timing.csv
-    and scenario.toml, together at the end. Every run is computed anew.
+    Writes evaluation.csv (a row per controller and seed), summary.json, timing.csv, scenario.toml
+    and, with --plot, evaluation.png, together at the end. Every run is computed anew.
 
     Args:
         controllers: Comma-separated, or the option again: naive, tuned, backed-off, cautious,
@@ -45,12 +47,15 @@ def evaluate(
         first_seed: The first seed.
         trajectories: In place of controllers: judge a folder of loops that another tool ran, one
             CSV file a seed (run-7.csv) with the states and the actions applied.
+        plot: Draw evaluation.png too, which takes a second.
     """
     with cli.output(json) as out_:
-        from cosim.evaluation import EVALUATION_FILES, named_controllers
+        from cosim.evaluation import EVALUATION_FILES, PICTURE, named_controllers
 
         task = cosim.Scenario.load(scenario)
         if trajectories is not None:
+            if plot:
+                raise CosimError("--plot draws controllers, not the runs of --trajectories")
             _evaluate_trajectories(task, trajectories, cli.open_folder(out), out_)
             return
         names = []
@@ -82,7 +87,9 @@ def evaluate(
         summary = evaluation.summary()
         # All files or none: a table and a summary in a folder are of one evaluation.
         with staged(folder, EVALUATION_FILES) as stage:
-            evaluation.write_files(stage)
+            evaluation.write_tables(stage)
+            if plot:
+                evaluation.plot(stage / PICTURE)
             cli.write_summary(stage, summary)
         show_evaluation(summary, out_, pairs)
         out_.note(f"files are in {folder.resolve()}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,7 +34,8 @@ def simulate(
 
     Writes trajectory.csv, timing.csv, summary.json, scenario.toml, with --plot trajectory.png and
     with --record run.rrd. Of more than 100 000 samples trajectory.parquet and timing.parquet are
-    written in place of the CSV files: the same columns, which pandas.read_parquet reads.
+    written in place of the CSV files, if pyarrow is installed: the same columns, which
+    pandas.read_parquet reads.
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
 
@@ -135,7 +137,8 @@ def _simulate(
         }
     if ended:
         summary["ended"] = ended
-    if len(run) > LONG_TABLE:
+    # pyarrow comes with the extra `view`; without it text is what there is.
+    if len(run) > LONG_TABLE and find_spec("pyarrow"):
         run.write_parquet(folder / "trajectory.parquet")
         run.write_timing_parquet(folder / "timing.parquet")
     else:

@@ -260,7 +260,8 @@ class Trajectory(Result):
         Args:
             width: in inches; by default that of two columns of a journal.
         """
-        from cosim.figures.trajectory import WIDTH, trajectory_figure  # noqa: PLC0415 - matplotlib
+        from cosim.figures.style import WIDTH  # noqa: PLC0415 - matplotlib
+        from cosim.figures.trajectory import trajectory_figure  # noqa: PLC0415
 
         return trajectory_figure(self, self.scenario, width=width or WIDTH)
 

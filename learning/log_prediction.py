@@ -41,7 +41,7 @@ class PredictedCosts(NamedTuple):
     outside: float
 
 
-class _Expectation:
+class Expectation:
     """What a model expects of the samples of a rollout, as shares in the mean cost.
 
     An error of the log has two parts in the mean: it moved the states that followed, and it is one
@@ -163,7 +163,7 @@ class Prediction:
         )
         for number, drawn in enumerate(models):
             model, errors_before = self._repeating(drawn)
-            expectation = _Expectation(self._problem, model, self._settings, number, self._burn_in)
+            expectation = Expectation(self._problem, model, self._settings, number, self._burn_in)
             predicted, h, _ = model.predict(self._inputs)
             persists = h * (errors_before @ model.persistence.T)
             logged[number] = expectation(predicted + persists, h)

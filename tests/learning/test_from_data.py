@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from controllers.factories import nmpc
+from controllers.problem import Problem
 from cosim import FmuPlant, build_controller, simulate
 from cosim.core.logged_data import LoggedData, LoggedDataError, read_logged_data
 from cosim.core.simulation import indicators_of
@@ -16,7 +17,8 @@ from learning.empirical_model import EmpiricalModel
 from learning.from_data import excitation
 from learning.log_checks import usable
 from learning.log_configuration import LogConfiguration
-from learning.log_prediction import difference
+from learning.log_prediction import Expectation, difference
+from learning.model_based import ExpectedCosts, ModelBasedConfiguration
 from tests.helpers.empirical import SETTINGS, fit, plant_data
 
 LOG = LogConfiguration()
@@ -83,6 +85,34 @@ MISREAD = {
         "logged stage cost is .* on average, and the model's",
     ),
 }
+
+
+def test_inputs_of_one_size_are_not_taken_for_exchanged(data, paper, features):
+    """Errors of parameters that exchanged inputs would undo: the nominal model prefers them."""
+    rng = np.random.default_rng(3)
+    count = len(data)
+    states = np.column_stack([rng.uniform(25, 30, count), rng.uniform(45, 55, count)])
+    actions = rng.normal([196.0, 204.0], 3.0, (count, 2))
+    errors = rng.normal(0.0, 0.15, features.n_parameters)
+    y, _, h = features(np.column_stack([states, actions]), errors)
+    next_states = y[:, :2] + 0.1 * h[:, :2] * rng.standard_normal((count, 2))
+    log = replace(data, states=states, actions=actions, next_states=next_states, stage_cost=None)
+    assert len(usable(log, paper, features, SETTINGS, LOG)) == count
+
+
+def test_shares_of_samples_have_the_mean_of_the_expected_costs(paper, features, rng):
+    """The chance of the errors moves where a cost stands in the log, not how large it is."""
+    problem = Problem.from_scenario(paper)
+    inputs, outputs = plant_data(features, rng, 300, np.zeros(features.n_parameters))
+    model = fit(features, inputs, outputs)
+    settings = ModelBasedConfiguration.from_dict({"tail_widening": 0.0})
+    predicted, h, _ = model.predict(inputs - [3.0, 0.0, 0.0, 0.0])
+    costs, _ = ExpectedCosts(problem, model, settings)(predicted, h)
+    shares = Expectation(problem, model, settings, 0, 20)(predicted, h)
+    assert shares.shape == (280,)
+    assert shares.mean() == pytest.approx(costs[20:].mean())
+    # Penalties of a few errors: their chance is larger than that of the states alone.
+    assert shares.std() > costs[20:].std()
 
 
 def steady(data):

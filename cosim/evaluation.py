@@ -24,6 +24,7 @@ from cosim.core.protocols import Array, Decision
 from cosim.core.result import Result, text_table
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import indicators, measure, reporting, simulate
+from cosim.core.training_options import PARAMETERS
 from cosim.core.validation import instead, whole_number
 from cosim.measurement import Factory, Measured, MeasureItem, Noise, built
 from cosim.plant import FmuPlant
@@ -280,15 +281,24 @@ def named_controllers(
         before, equals, after = item.partition("=")
         name = before.strip()
         source = after.strip() if equals else name
-        # A file of θ is called by its stem.
         if name.endswith(".toml"):
-            name = Path(name).stem
+            name = _name_of_file(name)
         if not name or not source:
             raise EvaluationError(f"controllers: '{item}' is not NAME=CONTROLLER")
         if name in named:
             raise EvaluationError(f"two controllers are called '{name}'; write NAME=… for one")
         named[name] = source
     return named
+
+
+def _name_of_file(path: str) -> str:
+    """What a file of θ is called: by its folder where a training named the file, else its stem."""
+    file = Path(path)
+    folder = file.parent.name
+    # All trainings call it the same.
+    if file.name == PARAMETERS and folder not in ("", ".."):
+        return folder
+    return file.stem
 
 
 def _distinct_seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:

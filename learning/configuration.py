@@ -1,4 +1,4 @@
-"""Hyperparameters: typed, documented, validated, by `name=value`."""
+"""Hyperparameters: typed, documented, validated, by `NAME=VALUE`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from controllers.model import Model
 from cosim.core.scenario import NonNegative, Positive, Scenario
-from cosim.core.validation import validated
+from cosim.core.validation import assignments, validated
 from learning.errors import ConfigurationError
 
 ALL = ("all",)
@@ -88,18 +88,17 @@ class Configuration(BaseModel):
     )
 
     @classmethod
-    def from_assignments(cls, assignments: Iterable[str]) -> Self:
-        """Build from `name=value` texts, values as in TOML (a bare word is a string).
+    def from_assignments(cls, texts: Iterable[str]) -> Self:
+        """Build from `NAME=VALUE` texts, values as in TOML (a bare word is a string).
 
         Raises ConfigurationError that names the field and what it may be.
         """
         # A bare word is a text, so that no shell needs two kinds of quotes.
         values: dict[str, Any] = {}
-        for assignment in assignments:
-            name, equals, text = assignment.partition("=")
-            if not equals:
-                raise ConfigurationError(f"'{assignment}' is no hyperparameter; write name=value")
-            values[name.strip()] = _value(text.strip())
+        for name, text in assignments(texts, "--set", "NAME=VALUE", ConfigurationError):
+            if name in values:
+                raise ConfigurationError(f"--set {name} is given twice")
+            values[name] = _value(text)
         return cls.from_dict(values)
 
     @classmethod
@@ -156,7 +155,7 @@ class Configuration(BaseModel):
         for name, field in cls.model_fields.items():
             allowed = _allowed(properties[name])
             meaning = field.description or ""
-            default = repr(field.default)
+            default = _as_typed(field.default)
             documented.append(Hyperparameter(name, default, allowed, meaning))
         return documented
 
@@ -185,6 +184,19 @@ class GreedyConfiguration(Configuration):
             if name.startswith("exploration_"):
                 names.append(name)
         return dict.fromkeys(names, "a rule that tries θ, not actions")
+
+
+def _as_typed(value: object) -> str:
+    """A default as one types it behind `--set NAME=`; `nothing` where it is None."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(_as_typed(entry) for entry in value)}]"
+    return str(value)
 
 
 def _value(text: str) -> Any:

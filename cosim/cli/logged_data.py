@@ -12,6 +12,7 @@ import cosim
 from cosim.cli import output as cli
 from cosim.core.errors import CosimError
 from cosim.core.training_options import PARAMETERS, TrainingOptions
+from cosim.core.validation import assignments
 
 if TYPE_CHECKING:
     from learning.configuration import Configuration
@@ -50,13 +51,10 @@ def refuse(options: Mapping[str, object], reason: str) -> None:
             raise CosimError(f"--{name} {reason}")
 
 
-def columns_by_name(assignments: list[str] | None) -> dict[str, str]:
+def columns_by_name(texts: list[str] | None) -> dict[str, str]:
     """The columns of variables, from texts NAME=COLUMN; raises CosimError."""
     columns: dict[str, str] = {}
-    for assignment in assignments or []:
-        name, equals, column = assignment.partition("=")
-        if not equals or not name or not column:
-            raise CosimError(f"--column {assignment}: write NAME=COLUMN")
+    for name, column in assignments(texts or [], "--column", "NAME=COLUMN", CosimError):
         if name in columns:
             raise CosimError(f"--column {name} is given twice")
         columns[name] = column

@@ -22,6 +22,8 @@ from cosim.core.training_options import MOST
 
 MOST_DRAWN = 20_000
 """Samples of the longest run that is drawn: more are a grey band, and take seconds."""
+FOLDED_WIDTH = 14
+"""Characters that a column of folded texts has at least."""
 LONG_DOCUMENT = 1 << 20
 """Bytes from which on a JSON document is written on one line: what is indented Python writes."""
 
@@ -102,8 +104,9 @@ class Output:
     ) -> None:
         """Print a table, columns of numbers right justified and the others left.
 
-        A file or pipe gets it as wide as it is. On a terminal that is too narrow, columns that do
-        not fit go to further tables below, each with the first column; wide texts are folded.
+        Where it is wider than the terminal, or than 80 characters in a file or pipe (`COLUMNS`
+        says another number), wide texts are folded, and columns that do not fit go to further
+        tables below, each with the first column.
 
         Args:
             title: a line above it.
@@ -117,27 +120,48 @@ class Output:
         from rich.table import Table
 
         console = Console()
-        # A file or pipe has no width: the table is as wide as it needs to be.
-        if not console.is_terminal:
-            console.width = 1000
         columns: list[list[str]] = []
         widths: list[int] = []
+        folded: list[bool] = []
         for number, name in enumerate(header):
             cells = [row[number] for row in rows]
             columns.append(cells)
-            # Cells are never folded; a heading may be, but that of the first column.
+            # A heading may be folded, but that of the first column.
             words = name.split() if widths else [name]
-            lengths = [len(word) for word in (*cells, *words)]
+            # So may texts of several words, but no number with its interval.
+            may_fold = bool(widths) and not all(_is_number(cell) for cell in cells)
+            folded.append(may_fold)
+            for cell in cells:
+                words += cell.split() if may_fold else [cell]
+            longest = max((len(word) for word in words), default=0)
+            if may_fold:
+                # As wide as its cells need, but no wider than a column of short lines.
+                widest_cell = max((len(cell) for cell in cells), default=0)
+                longest = max(longest, min(widest_cell, FOLDED_WIDTH))
             # A border, and a space on either side.
-            width = max(lengths, default=0) + 3
-            widths.append(width)
+            widths.append(longest + 3)
         for part in _fitting_tables(widths, console.width - 1):
-            table = Table(title=escape(title), title_justify="left", min_width=len(title))
+            width = min(len(title), console.width)
+            # The room that the table takes with nothing folded.
+            full_width = 1
+            for number in part:
+                full_width += 3 + max(len(text) for text in [header[number], *columns[number]])
+            fits = full_width <= console.width
+            table = Table(title=escape(title), title_justify="left", min_width=width)
             for number in part:
                 is_numeric = all(_is_number(cell) for cell in columns[number])
                 justify: Any = "right" if is_numeric else "left"
                 heading = escape(header[number])
-                table.add_column(heading, justify=justify, overflow="fold")
+                # The widest texts have the room that the other columns leave.
+                is_widest = number == _widest(part, columns, folded)
+                table.add_column(
+                    heading,
+                    justify=justify,
+                    overflow="fold",
+                    no_wrap=not folded[number] and number == part[0],
+                    min_width=widths[number] - 3,
+                    max_width=None if is_widest or fits else widths[number] - 3,
+                )
             for row in rows:
                 # Rich would read `[X2]` as a style.
                 cells = [escape(row[number]) for number in part]
@@ -181,6 +205,20 @@ def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:
         tables[-1].append(column)
         used += widths[column]
     return tables
+
+
+def _widest(part: Sequence[int], columns: Sequence[Sequence[str]], folded: Sequence[bool]) -> int:
+    """The column of a table that has the longest texts; −1 where none may be folded."""
+    longest = 0
+    widest = -1
+    for number in part:
+        if not folded[number]:
+            continue
+        for cell in columns[number]:
+            if len(cell) > longest:
+                longest = len(cell)
+                widest = number
+    return widest
 
 
 def _is_number(cell: str) -> bool:

@@ -59,7 +59,7 @@ def train(
         samples: Plant samples; default: the algorithm's, or 50 000.
         resume: Go on from the folder's checkpoint.
         overwrite: Begin anew where the folder holds another run.
-        assignments: Hyperparameter as name=value; may be repeated.
+        assignments: Hyperparameter as NAME=VALUE; may be repeated.
         explain: List the algorithm's hyperparameters and stop.
         gif: Draw learning.gif too: the loop while θ is learned.
         options: Those of `TrainingOptions`, each an option of the command.

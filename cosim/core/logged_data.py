@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import CosimError
 from cosim.core.protocols import Array
 from cosim.core.scenario import Scenario
-from cosim.core.validation import instead, suggestion
+from cosim.core.validation import assignments, instead, suggestion
 
 Flags = NDArray[np.bool_]
 """One truth value per row, or per pair of consecutive rows."""
@@ -553,14 +553,13 @@ def _is_date(text: str) -> bool:
 def _excluded(file: _File, orders: Sequence[str]) -> Flags:
     """Rows that the user leaves out, (K,), by orders `COLUMN=VALUE`."""
     excluded = np.zeros(len(file.rows), bool)
-    for order in orders:
-        column, equals, value = order.partition("=")
-        if not equals:
-            raise LoggedDataError(f"--leave-out {order}: write COLUMN=VALUE")
+    for column, value in assignments(orders, "--leave-out", "COLUMN=VALUE", LoggedDataError):
         texts = np.array(file.texts(file.position(column)))
         rows = texts == value
         # An order that acts nowhere is a mistake of its user, who expects it to act.
         if not rows.any():
-            raise LoggedDataError(f"--leave-out {order}: no row has '{value}' in '{column}'")
+            raise LoggedDataError(
+                f"--leave-out {column}={value}: no row has '{value}' in '{column}'"
+            )
         excluded |= rows
     return excluded

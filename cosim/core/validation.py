@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from operator import index
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -28,6 +28,30 @@ def _no_boolean(value: object) -> object:
 
 SchemaVersion = Annotated[Literal[1], BeforeValidator(_no_boolean)]
 """Version of a document's form; to Python true is 1."""
+
+
+def assignments(
+    texts: Iterable[str],
+    option: str,
+    form: str,
+    error: type[Exception],
+) -> Iterator[tuple[str, str]]:
+    """Names and values of texts `NAME=VALUE`, as options give them.
+
+    Args:
+        texts: what was given, in its order; a value may hold further signs of equality.
+        option: that of the command line, `--set` say.
+        form: how one is written, `NAME=VALUE` say.
+        error: class of the exception that is raised.
+
+    Raises:
+        error: a text has no name or no sign of equality.
+    """
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name.strip():
+            raise error(f"{option} {text}: write {form}")
+        yield name.strip(), value.strip()
 
 
 def validated(

@@ -41,7 +41,7 @@ def test_assignments_are_read_as_toml_and_bare_words_as_text():
 @pytest.mark.parametrize(
     ("algorithm", "assignment", "message"),
     [
-        ("q-learning", "prior_width", "write name=value"),
+        ("q-learning", "prior_width", "--set prior_width: write NAME=VALUE"),
         ("q-learning", "prior_widht=0.1", "did you mean 'prior_width'"),
         ("q-learning", "prior_width=nan", "prior_width"),
         ("q-learning", "rule=newton", "rule.*td"),

@@ -127,49 +127,50 @@ app = typer.Typer(
     epilog="Example: cosim demo --out demo",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-RUN_PANEL = "Run, look and compare"
-LEARN = "Learn"
-BUILD = "Build and hand over"
+LOOK = "A first look"
+COMPARE = "Compare rules and controllers"
+PLANT = "Control your own plant"
+CHECK = "Check the claims"
 for panel, function, example in (
-    (RUN_PANEL, demo.demo, "demo --out demo"),
+    (LOOK, demo.demo, "demo --out demo"),
     (
-        RUN_PANEL,
+        LOOK,
         simulate.simulate,
         "simulate --scenario paper --controller tuned --steps 500 --record",
     ),
     (
-        RUN_PANEL,
+        COMPARE,
         evaluate.evaluate,
         "evaluate --scenario fouled --controllers naive,tuned --seeds 10",
     ),
     (
-        RUN_PANEL,
+        PLANT,
         shadow.shadow,
         "shadow cautious --data cosim-run/trajectory.csv --scenario fouled",
     ),
-    (LEARN, train.train, "train --algorithm q-learning --samples 20000 --out learnt"),
-    (RUN_PANEL, view.view, "view cosim-run/run.rrd --png run.png"),
-    (RUN_PANEL, compare.compare, "compare cosim-run other-run --relative 1e-9"),
-    (LEARN, optimum.optimum, "optimum --scenario paper"),
-    (LEARN, optimum.tuning, "tuning --scenario paper --out tuned.toml"),
-    (BUILD, new.new, "new rule my_rule"),
-    (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
-    (RUN_PANEL, study.reproduce, "reproduce --budget quick --out reproduction"),
+    (COMPARE, train.train, "train --algorithm q-learning --samples 20000 --out learnt"),
+    (LOOK, view.view, "view cosim-run/run.rrd --png run.png"),
+    (COMPARE, compare.compare, "compare cosim-run other-run --relative 1e-9"),
+    (COMPARE, optimum.optimum, "optimum --scenario paper"),
+    (PLANT, optimum.tuning, "tuning --scenario paper --out tuned.toml"),
+    (COMPARE, new.new, "new rule my_rule"),
+    (PLANT, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
+    (CHECK, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
     epilog = f"Example: cosim {example}"
     app.command(rich_help_panel=panel, help=_help_text(function), epilog=epilog)(function)
 for panel, group, name, *examples in (
-    (BUILD, scenario.scenario_app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
+    (PLANT, scenario.scenario_app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
     (
-        LEARN,
+        COMPARE,
         study.study_app,
         "study",
         "run mine.toml --out study",
         "plan mine.toml",
         "report study",
     ),
-    (LEARN, study.results_app, "results", "check quick", "update quick", "draw quick"),
-    (BUILD, fmu.fmu_app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
+    (CHECK, study.results_app, "results", "check quick", "update quick", "draw quick"),
+    (PLANT, fmu.fmu_app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
 ):
     texts = [f"Example: cosim {name} {example}" for example in examples]
     app.add_typer(group, name=name, rich_help_panel=panel, epilog=texts[0])

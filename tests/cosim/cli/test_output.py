@@ -18,3 +18,16 @@ def test_a_reader_who_leaves_hears_nothing():
     with os.fdopen(writing, "w") as closed:
         ended = subprocess.run(words, stdout=closed, stderr=subprocess.PIPE, check=False)
     assert (ended.returncode, ended.stderr) == (141, b"")
+
+
+def test_a_table_fits_its_columns_and_loses_no_word(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    meaning = "what a reader wants to know of it, at some length, " * 3
+    header = ("name", "default", "allowed", "meaning")
+    rows = [("an_uncommonly_long_name", "[0.1, 0.01]", "list of number > 0 or nothing", meaning)]
+    Output(False).table("t", header, rows)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(len(line) for line in lines) <= 80
+    (first,) = [line for line in lines if "an_uncommonly_long_name" in line]
+    assert "[0.1, 0.01]" in first and "list of number" in first and "what a reader" in first
+    assert "length," in "".join(lines)

@@ -7,6 +7,7 @@ import pytest
 from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
 from cosim.core.errors import EvaluationError
+from cosim.evaluation import named_controllers
 from cosim.workers import done
 from tests.helpers.loop import Proportional, hold, proportional
 from tests.helpers.workers import LEDGER, always_dying, mortal, noting, sluggish
@@ -160,3 +161,26 @@ def test_a_plug_in_that_exits_ends_in_an_error(paper):
 def test_a_malformed_request_is_refused(paper, controllers, seeds, steps):
     with pytest.raises(EvaluationError):
         evaluate(paper, controllers, seeds, steps)
+
+
+def test_a_learned_controller_has_the_name_of_its_folder():
+    files = [
+        "runs/mine/parameters.toml",
+        "parameters.toml",
+        "runs/other.toml",
+        "a=b/parameters.toml",
+    ]
+    assert list(named_controllers(files)) == ["mine", "parameters", "other", "a"]
+
+
+def test_a_printed_table_has_regret_in_per_cent_and_the_columns_asked_for(paper):
+    evaluation = evaluate(paper, {"proportional": proportional, "optimal": "optimal"}, 2, 20)
+    header, _, row, best = str(evaluation).splitlines()
+    assert header.split(" | ")[1] == "regret %" and len(header.split(" | ")) == 6
+    regret = 100 * (evaluation.column("proportional", "J") - evaluation.optimal).mean()
+    regret /= evaluation.optimal.mean()
+    assert float(row.split(" | ")[1].split()[0]) == pytest.approx(regret, rel=0.1)
+    assert best.split(" | ")[1].startswith("0 ")
+    assert evaluation.table(["controller", "J"]).startswith("| controller | J |")
+    with pytest.raises(EvaluationError, match=r"no column 'regre' \(did you mean 'regret'"):
+        evaluation.table(["regre"])

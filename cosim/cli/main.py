@@ -39,7 +39,7 @@ OUTPUT_OPTIONS = ("--out", "-o", "--png", "--ssp", "--record")
 """Options whose value is an output path."""
 
 OPTIONS_OF_PANELS = {
-    "Files and output": ("out", "overwrite", "record", "png", "ssp", "json"),
+    "Files and output": ("out", "overwrite", "plot", "record", "png", "ssp", "json"),
     "Log and evaluation": (
         "log_every", "evaluate_every", "checkpoint_every", "divergence", "resume",
         "evaluation_seeds", "evaluation_steps",

@@ -138,7 +138,8 @@ def _train(start: str, samples: int, seed: int, output: cli.Output) -> dict[str,
             start=start,
             log_every=log_every,
             evaluate_every=evaluate_every,
-            checkpoint_every=samples,
+            # No folder is given, and nothing is resumed.
+            checkpoint_every=12 * log_every,
             progress=output.live,
         )
         # The file is not there afterwards: its θ is that of a controller with a name.

@@ -188,7 +188,7 @@ def test_without_a_cache_the_folder_ends_with_the_process(tmp_path):
         "simulate --steps 30 --record --out out",
         "evaluate --seeds 2 --steps 30 --jobs 2 --out out",
         "train --algorithm q-learning --samples 100 --log-every 50 --evaluate-every 100 --out out",
-        "demo --steps 30 --out out",
+        "demo --samples 100 --steps 30 --out out",
     ],
 )
 def test_a_command_leaves_nothing_in_the_folder_for_temporary_files(tmp_path, words):

@@ -38,3 +38,13 @@ def test_the_start_is_its_zero_the_optimum_its_one(scenario, problem, parameters
         assert evaluating.limit == pytest.approx(1.5 * naive["J"])
         unknown = evaluator(plant, parameters).evaluate(parameters.theta)
         assert unknown["gap_closed"] is unknown["regret"] is None
+
+
+def test_runs_that_start_alike_share_their_evaluation(scenario, parameters):
+    run = make_run("q-learning", scenario, divergence=1.5, evaluation_steps=30)
+    known = {}
+    with FmuPlant(scenario) as plant:
+        first = Evaluator(run, plant, parameters, None, known)
+    again = Evaluator(run, None, parameters, None, known)
+    assert again.start == first.start and again.limit == first.limit
+    assert first.samples > 0 and again.samples == 0

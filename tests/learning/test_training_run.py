@@ -94,3 +94,11 @@ def test_a_file_keeps_its_own_slack_weights_and_model_parameters(problem, tmp_pa
     }
     with pytest.raises(ConfigurationError, match="parametrisation=extended"):
         starting_parameters(problem, Configuration(parametrisation="paper"), path)
+
+
+def test_checkpoints_are_close_where_a_step_may_take_long(scenario):
+    foreign = scenario.replace({"plant": {"fmu": str(fmus.path(scenario.plant.fmu))}})
+    slow = make_run("q-learning", foreign, 20_000)
+    fast = make_run("q-learning", scenario, 20_000)
+    assert (slow.log_every, slow.checkpoint_every, slow.evaluate_every) == (100, 100, 5000)
+    assert (fast.log_every, fast.checkpoint_every, fast.evaluate_every) == (1000, 5000, 5000)

@@ -392,11 +392,13 @@ class BackOffSearch:
         self._number = 0
         self._candidates = np.tile(self.kappa, (len(offsets), 1))
         self._candidates[:, bound] = np.maximum(wanted, self._least(bound))
-        # One sample at least counts, once the loop has settled.
+        # The round's share of the budget, over its segments.
         share = self.settings.round_shares[phase]
         parts = self._shares * len(offsets)
         length = int(self._budget * factor * share / parts)
-        self._segment = Segment(max(length, self._settling + 1), 2 * self._n)
+        # One sample at least counts, once the loop has settled.
+        length = max(length, self._settling + 1)
+        self._segment = Segment(length, 2 * self._n)
 
     def _offsets(self, bound: int, phase: Phase) -> tuple[float, ...]:
         """κ that a round tries of its bound, from the best so far on."""

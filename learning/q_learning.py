@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from controllers.theta import Parameters
-from cosim.core.protocols import Array, Matrix, Vector
+from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import NonNegative, Positive, Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
@@ -160,12 +160,6 @@ class QLearningConfiguration(ValueConfiguration):
         "slowest time constants of the nominal model and ten samples at least, is taken off ∇Q, "
         "for the level of Q means nothing; 0: it stays in",
     )
-    explained_noise: int = Field(
-        0,
-        ge=0,
-        description="latest samples that say what of a TD error the sample's own prediction error "
-        "explains, which is then taken off it; 0: it stays in",
-    )
     parameter_drift: NonNegative = Field(
         0.0,
         description="variance that each sample adds to θ, in units of the prior's, so that "
@@ -203,7 +197,7 @@ class QLearningConfiguration(ValueConfiguration):
         names = ["step_size", "scaled"]
         if self.rule != "kalman":
             names = [name for name in ValueConfiguration.model_fields if name != "discount"]
-            names += ["prior_samples", "step_every", "explained_noise", "parameter_drift"]
+            names += ["prior_samples", "step_every", "parameter_drift"]
             names += ["mean_cost_memory", "gradient_mean_memory"]
             for name in Configuration.model_fields:
                 names.remove(name)
@@ -370,8 +364,7 @@ class QLearning(ValueRule):
 
     with f the controller's nominal model and e_i its latest prediction errors. Every `step_every`
     samples θ moves by d under its constraints, in the metric P⁻¹. The warm-up of `prior_samples`
-    moves only c_f, which becomes the mean of e. With the setting `explained_noise` δ loses what
-    `ExplainedNoise` says of it (docs/rules/q-learning.md).
+    moves only c_f, which becomes the mean of e (docs/rules/q-learning.md).
     """
 
     learns_from_estimates = True
@@ -385,8 +378,7 @@ class QLearning(ValueRule):
         settings = self.configuration
         if settings.rule != "kalman" and settings.scaled:
             self._set_coordinates(self.controller.parameters.blocks.scale)
-        self._warm_up: list[list[float]] = []  # rows (s, a, e, δ)
-        self._noise = ExplainedNoise(settings.explained_noise, self._model.n_states)
+        self._warm_up: list[list[float]] = []  # rows (s, e, δ)
         self._regression = self._new_regression(1.0)
         self._count = 0
         self._sum_of_squares = 0.0  # of the innovations since the last step
@@ -409,12 +401,6 @@ class QLearning(ValueRule):
         target = self._average_cost.target(cost, next_value)
         td_error = target - solution.value
         mean_cost = self._average_cost.mean_cost
-        # The mean cost is not known yet in the warm-up, and follows δ later: δ is kept with it.
-        level = td_error + mean_cost
-        state_and_action = np.concatenate([transition.s, transition.a])
-        # What earlier samples say of this one; it is none of these yet.
-        td_error -= self._noise.of(state_and_action, error)
-        self._noise.add(state_and_action, error, level)
         self._average_cost.follow(td_error)
         gradient = self._average_cost.without_level(solution.value_gradient)
 
@@ -422,7 +408,9 @@ class QLearning(ValueRule):
         # In the warm-up no θ moves: its samples say how large noise and errors are.
         left = self.configuration.prior_samples - self._count
         if left >= 0:
-            row = [*state_and_action.tolist(), *error.tolist(), level]
+            # The mean cost is not known yet: δ is kept with it.
+            level = td_error + mean_cost
+            row = [*transition.s.tolist(), *error.tolist(), level]
             self._warm_up.append(row)
             return self._begin_regression() if left == 0 else None
 
@@ -434,7 +422,6 @@ class QLearning(ValueRule):
         mean_square = self._sum_of_squares / self.configuration.step_every
         error_size = mean_square**0.5
         self._sum_of_squares = 0.0
-        self._noise.fit()
         fit = self._average_cost.absorb(self._regression.step())
         return self._step.apply(fit, error_size)
 
@@ -444,11 +431,8 @@ class QLearning(ValueRule):
         self._warm_up.clear()
         n = self._model.n_states
         states = rows[:, :n]
-        states_and_actions = rows[:, : -n - 1]
-        errors = rows[:, -n - 1 : -1]
+        errors = rows[:, n:-1]
         levels = rows[:, -1]
-        self._noise.fit()
-        levels = levels - self._noise.of(states_and_actions, errors)
         # The start's TD errors are the noise that the filter expects.
         td_errors = self._average_cost.begin(levels)
         variance = float(np.mean(td_errors**2))
@@ -502,7 +486,6 @@ class QLearning(ValueRule):
         return {
             **super().state_dict(),
             **prefixed("regression", self._regression.state_dict()),
-            **prefixed("noise", self._noise.state_dict()),
             "warm_up": np.array(self._warm_up),
             "count": self._count,
             "sum_of_squares": self._sum_of_squares,
@@ -512,111 +495,9 @@ class QLearning(ValueRule):
         """Restore what `state_dict` returned."""
         super().load_state_dict(state)
         self._regression.load_state_dict(part_of(state, "regression"))
-        self._noise.load_state_dict(part_of(state, "noise"))
         self._warm_up = state["warm_up"].tolist()
         self._count = state["count"]
         self._sum_of_squares = state["sum_of_squares"]
-
-
-class ExplainedNoise:
-    """What of a TD error δ the prediction error e of the same sample explains: a control variate.
-
-    The disturbance of a sample moves s₊, and with it V(s₊) and ℓ: most of the variance of δ is
-    that, and none of it says anything of Q(s, a). With ε the part of e that is not affine in (s, a)
-
-        δ − βᵀε
-
-    has the expectation of δ given (s, a), whatever β, since that of ε is zero (but for what of a
-    wrong model is not affine in s and a). β is that of the least squares of δ on ε, where δ is
-    clipped at ±clip deviations: rare penalties say little of V's slope.
-
-    Source: Glasserman, Monte Carlo Methods in Financial Engineering, 2003, ch. 4.1.
-
-    Args:
-        memory: latest samples that say what β is; 0: nothing is explained.
-        n_states: n.
-        clip: deviations, by the median, at which δ is clipped.
-    """
-
-    def __init__(
-        self,
-        memory: int,
-        n_states: int,
-        clip: float = 3.0,
-    ) -> None:
-        self._memory = memory
-        self._n_states = n_states
-        self._clip = clip
-        self._rows: list[list[float]] = []  # (1, s, a, e, δ) of the latest samples
-        self._affine: Matrix = np.zeros((0, 0))  # e on (1, s, a), (1+n+m, n)
-        self._slope: Vector = np.zeros(0)  # β, (n,); empty where nothing is known
-
-    def add(self, state_and_action: Vector, error: Vector, td_error: float) -> None:
-        """Keep a sample.
-
-        Args:
-            state_and_action: (s, a), (n+m,).
-            error: e, (n,).
-            td_error: δ; a constant in it is without effect.
-        """
-        if not self._memory:
-            return
-        self._rows.append([1.0, *state_and_action.tolist(), *error.tolist(), td_error])
-        if len(self._rows) > self._memory:
-            del self._rows[0]
-
-    def fit(self) -> None:
-        """Find β from the samples that are kept."""
-        if not self._memory:
-            return
-        rows = np.array(self._rows)
-        n = self._n_states
-        features = rows[:, : -n - 1]
-        errors = rows[:, -n - 1 : -1]
-        td_errors = rows[:, -1]
-        # Of few samples an affine part would leave nothing.
-        if len(rows) < 10 * features.shape[1]:
-            return
-        # In units of their size: a state in Pa must not hide one that is a fraction.
-        unit = np.abs(features).max(axis=0)
-        unit = np.where(unit > 0, unit, 1.0)
-        affine, *_ = np.linalg.lstsq(features / unit, errors)
-        self._affine = affine / unit[:, None]
-        left = errors - features @ self._affine
-        from_median = td_errors - np.median(td_errors)
-        # The median of |x| is .6745 deviations of a normal x.
-        deviation = np.median(np.abs(from_median)) / 0.6745
-        largest = self._clip * deviation
-        clipped = np.clip(from_median, -largest, largest)
-        size = np.abs(left).max(axis=0)
-        size = np.where(size > 0, size, 1.0)
-        slope, *_ = np.linalg.lstsq(left / size, clipped - clipped.mean())
-        self._slope = slope / size
-
-    def of(self, states_and_actions: Array, errors: Array) -> Any:
-        """βᵀε of a sample or of several; zero where nothing is known.
-
-        Args:
-            states_and_actions: (s, a), (n+m,) or (K, n+m).
-            errors: e, (n,) or (K, n).
-
-        Returns:
-            A number, or (K,).
-        """
-        if not len(self._slope):
-            return 0.0
-        expected = self._affine[0] + states_and_actions @ self._affine[1:]
-        return (errors - expected) @ self._slope
-
-    def state_dict(self) -> State:
-        """The samples, and what they say."""
-        return {"rows": np.array(self._rows), "affine": self._affine, "slope": self._slope}
-
-    def load_state_dict(self, state: State) -> None:
-        """Restore what `state_dict` returned."""
-        self._rows = state["rows"].tolist()
-        self._affine = state["affine"]
-        self._slope = state["slope"]
 
 
 def redundancy_of(states: Matrix, errors: Matrix, doubt: float) -> float:

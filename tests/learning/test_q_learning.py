@@ -5,12 +5,7 @@ import pytest
 
 from controllers.rti import RtiNmpc
 from learning import QLearning
-from learning.q_learning import (
-    AverageCost,
-    ExplainedNoise,
-    KalmanRegression,
-    redundancy_of,
-)
+from learning.q_learning import AverageCost, KalmanRegression, redundancy_of
 from learning.step import Fit
 from learning.training_run import starting_parameters
 from tests.helpers.training import looped
@@ -211,58 +206,3 @@ def test_mean_cost_takes_the_step_of_c_lambda():
     assert average_cost.mean_cost == pytest.approx(6000.0 - 4.0)
     assert rest.minimiser.tolist() == [0.3, 0.0]
     assert rest.gradient == pytest.approx(rest.metric() @ rest.minimiser)
-
-
-class Explained:
-    """Samples of a wrong model, and TD errors of which the noise of s₊ makes the most part."""
-
-    MEMORY = 4000
-
-    def __init__(self):
-        rng = np.random.default_rng(5)
-        n_samples = 2 * self.MEMORY
-        self.states_and_actions = rng.normal(size=(n_samples, 3)) * [1.0, 1e5, 1e-4] + 3.0
-        wrong = self.states_and_actions @ np.array([[0.2], [1e-6], [3e3]]) + 0.7
-        noise = rng.normal(size=(n_samples, 1))
-        self.errors = wrong + noise
-        self.meant = 100.0 * self.states_and_actions[:, 0]
-        self.td_errors = self.meant - 300.0 * noise[:, 0] + 10.0 * rng.normal(size=n_samples)
-        # Rare penalties, which have another slope.
-        self.td_errors[::50] += 1e5
-        self.explained = ExplainedNoise(self.MEMORY, n_states=1)
-        for k in range(self.MEMORY):
-            self.explained.add(self.states_and_actions[k], self.errors[k], self.td_errors[k])
-        self.explained.fit()
-
-    def left(self):
-        """Of the samples that β does not know, without the rare penalties: (δ, what is left)."""
-        later = [k for k in range(self.MEMORY, len(self.errors)) if k % 50]
-        taken = self.explained.of(self.states_and_actions[later], self.errors[later])
-        return later, self.td_errors[later], self.td_errors[later] - taken
-
-
-def test_what_the_prediction_error_explains_is_no_noise_of_a_td_error():
-    samples = Explained()
-    later, td_errors, left = samples.left()
-    around = left - samples.meant[later]
-    assert td_errors.std() > 290
-    assert around.std() < 40
-
-
-def test_what_a_td_error_is_expected_to_be_stays():
-    """What a wrong model makes of (s, a) is no noise: Q-learning is there to learn it."""
-    samples = Explained()
-    later, _, left = samples.left()
-    ones = np.ones((len(later), 1))
-    deviations = samples.states_and_actions[later] - 3.0
-    features = np.hstack([ones, deviations / [1.0, 1e5, 1e-4]])
-    coefficients, *_ = np.linalg.lstsq(features, left)
-    # Four deviations of 300/√4000; what is affine in e would add 60, 30 and 90.
-    assert coefficients[1:] == pytest.approx([100.0, 0.0, 0.0], abs=19.0)
-
-
-def test_nothing_is_explained_without_samples():
-    silent = ExplainedNoise(memory=0, n_states=1)
-    silent.add(np.ones(3), np.ones(1), 1.0)
-    silent.fit()
-    assert silent.of(np.ones(3), np.ones(1)) == 0.0

@@ -23,7 +23,7 @@ IN_PLANT_UNITS = pytest.mark.xfail(
 )
 SAMPLES = 160
 SETTINGS = {
-    QLearning: {"prior_samples": 100, "step_every": 20, "explained_noise": 100},
+    QLearning: {"prior_samples": 100, "step_every": 20},
     BatchQLearning: {"first_batch": 100, "batch_size": 50},
     ActorCritic: {"batch_size": 100},
 }

@@ -157,13 +157,12 @@ def _gain(summary: dict[str, Any], name: str, samples: int) -> str:
     ]
     gain = pair["gain_in_J"]
     low, high = gain["bootstrap"] or gain["interval"]
+    # Less than the last decimal shown is rounding, whatever the interval.
+    numbers = [round(100 * number, 2) for number in (gain["value"], low, high)]
+    value, low, high = numbers
+    learned = f"{name} after {samples} samples"
     if low > 0:
-        verdict = "costs less than"
-    elif high < 0:
-        verdict = "costs more than"
-    else:
-        verdict = "cannot be told from"
-    return (
-        f"{name} after {samples} samples {verdict} {START}: "
-        f"{100 * gain['value']:.2f} % [{100 * low:.2f}, {100 * high:.2f}]"
-    )
+        return f"{learned} costs {value:.2f} % [{low:.2f}, {high:.2f}] less than {START}"
+    if high < 0:
+        return f"{learned} costs {-value:.2f} % [{-high:.2f}, {-low:.2f}] more than {START}"
+    return f"{learned} cannot be told from {START}"

@@ -19,9 +19,6 @@ from learning.algorithm import Transition
 from learning.checkpoint import State, part_of, prefixed
 from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration, Features
 
-NO_SIGNALS: Array = np.empty(0)
-"""What signals give of the model where there are none."""
-
 
 class Predictions(NamedTuple):
     """What a model says of T samples, and what became of them.
@@ -69,13 +66,15 @@ class PlantData:
         # Of the samples since the fit, a block for each `change_windows[0]` of them.
         self._blocks: list[Predictions] = []
 
-    def add(self, transition: Transition, signals: Array = NO_SIGNALS) -> None:
+    def add(self, transition: Transition, signals: Array | None = None) -> None:
         """Keep a transition in place of the oldest one.
 
         Args:
             transition: the transition.
-            signals: what signals give of the model at its sample, v, (n_v,).
+            signals: what signals give of the model at its sample, v, (n_v,); None without any.
         """
+        if signals is None:
+            signals = np.empty(0)
         # Without the penalty, which is known: what is learned is smooth.
         stage_cost = np.array([transition.stage_cost])
         oldest = self.count % len(self._rows)

@@ -31,12 +31,15 @@ class SignalCosts:
         parameters = ca.SX(ca.DM(model.nominal_parameters))
         for row, item in enumerate(self._prices):
             parameters[item.place] = prices[row]
+        still = ca.SX(ca.DM(model.nominal_parameters))
         x = ca.SX(ca.DM(problem.reference_state))
         u = ca.SX(ca.DM(problem.reference_action))
         d = ca.SX(ca.DM(model.nominal_disturbance))
-        still = ca.SX(ca.DM(model.nominal_parameters))
-        change = model.economic_cost(x, u, d, parameters) - model.economic_cost(x, u, d, still)
-        self._change = StackedFunction(define("change", {"prices": prices}, {"change": change}))
+        cost_at_prices = model.economic_cost(x, u, d, parameters)
+        cost_at_nominal_prices = model.economic_cost(x, u, d, still)
+        change = cost_at_prices - cost_at_nominal_prices
+        definition = define("change", {"prices": prices}, {"change": change})
+        self._change = StackedFunction(definition)
         self._changes: dict[tuple[float, ...], float] = {}
 
     def of_sample(self, known: Known) -> tuple[float, float]:

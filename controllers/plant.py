@@ -20,7 +20,7 @@ from fmus.model import FmiVersion
 from fmus.plant import Signal, plant_model
 from fmus.plant import build_plant as build_from_c
 
-COST = "cost"
+COST_OUTPUT = "cost"
 """Output of the FMU that is the stage cost."""
 EQUATIONS = "plant_equations"
 """C function of the rates and outputs."""
@@ -72,15 +72,15 @@ def build_plant(
     time_constants = dict(time_constants or {})
     values = dict(values or {})
     units = dict(units or {})
-    disturbances = _names(model.disturbances)
-    known = [*_names(model.states), *_names(model.actions), *disturbances]
-    known += _names(model.parameters)
-    computed = [COST, *model.outputs]
-    _check_names(model, "limits", limits, [*known, *computed])
-    _check_names(model, "ranges", ranges, disturbances)
-    _check_names(model, "time_constants", time_constants, disturbances)
-    _check_names(model, "values", values, known)
-    _check_names(model, "units", units, computed)
+    disturbances = _names_of(model.disturbances)
+    known = [*_names_of(model.states), *_names_of(model.actions), *disturbances]
+    known += _names_of(model.parameters)
+    computed = [COST_OUTPUT, *model.outputs]
+    _check_known(model, "limits", limits, [*known, *computed])
+    _check_known(model, "ranges", ranges, disturbances)
+    _check_known(model, "time_constants", time_constants, disturbances)
+    _check_known(model, "values", values, known)
+    _check_known(model, "units", units, computed)
     _check_numbers(model, "ranges", ranges, 0.0)
     _check_numbers(model, "time_constants", time_constants, 0.0)
     _check_numbers(model, "values", values, -inf)
@@ -132,10 +132,10 @@ def build_plant(
         description=description,
     )
     _check_identifiers(model, [variable.identifier for variable in table.variables])
-    return build_from_c(table, equations(model), target, version, every_platform)
+    return build_from_c(table, equations_in_c(model), target, version, every_platform)
 
 
-def equations(model: Model) -> str:
+def equations_in_c(model: Model) -> str:
     """C header of a model's equations, as `fmus.plant.build_plant` takes it.
 
     Args:
@@ -175,7 +175,7 @@ def equations(model: Model) -> str:
     ]
     for i, quantity in enumerate(model.states):
         lines.append(f"v[VR_der_{quantity.name}] = rates[{i}];")
-    for i, name in enumerate((COST, *model.outputs)):
+    for i, name in enumerate((COST_OUTPUT, *model.outputs)):
         lines.append(f"v[VR_{name}] = outputs[{i}];")
     body = "\n".join(f"    {line}" for line in lines)
     return f"""/* Generated from the model {model.name}; do not edit. */
@@ -193,11 +193,11 @@ static void evaluate(double v[N_VARIABLES]) {{
 """
 
 
-def _names(quantities: Iterable[Quantity]) -> list[str]:
+def _names_of(quantities: Iterable[Quantity]) -> list[str]:
     return [quantity.name for quantity in quantities]
 
 
-def _check_names(
+def _check_known(
     model: Model,
     argument: str,
     names: Iterable[str],
@@ -228,7 +228,7 @@ def _check_numbers(
 def _check_identifiers(model: Model, identifiers: list[str]) -> None:
     """Refuse names that C does not know apart, or that the FMU needs for itself."""
     for quantities in (model.states, model.actions, model.disturbances, model.parameters):
-        for name in [model.name, *_names(quantities), *model.outputs]:
+        for name in [model.name, *_names_of(quantities), *model.outputs]:
             if not name.isidentifier() or not name.isascii():
                 raise ModelError(
                     f"model '{model.name}': '{name}' is no name in C: letters, digits and _"

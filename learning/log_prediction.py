@@ -23,9 +23,6 @@ from learning.empirical_model import EmpiricalModel
 from learning.model_based import ExpectedCosts, ModelBasedConfiguration
 from learning.rollout import Rollout
 
-ERRORS_AT = 64
-"""Samples of each model at which the errors' shares of a penalty are weighed."""
-
 
 class PredictedCosts(NamedTuple):
     """Costs that D drawn models predict of the M samples that count.
@@ -87,7 +84,8 @@ class Expectation:
     def _by_error(self, predicted: Array, h: Array) -> Array:
         """Mean penalty of the samples if each had this one error, (T,)."""
         count, n = self._errors.shape
-        every = max(count // ERRORS_AT, 1)
+        # All models together weigh an error at a thousand samples.
+        every = max(count // 64, 1)
         rows = np.arange(self._number % every, count, every)
         errors = h[rows, None, :n] * self._errors
         states = predicted[rows, None, :n] + errors

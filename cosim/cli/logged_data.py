@@ -12,7 +12,6 @@ import cosim
 from cosim.cli import output as cli
 from cosim.core.errors import CosimError
 from cosim.core.training_options import PARAMETERS, TrainingOptions
-from cosim.core.validation import assignments
 
 if TYPE_CHECKING:
     from learning.configuration import Configuration
@@ -54,6 +53,8 @@ def refuse(options: Mapping[str, object], reason: str) -> None:
 def columns_by_name(texts: list[str] | None) -> dict[str, str]:
     """The columns of variables, from texts NAME=COLUMN; raises CosimError."""
     columns: dict[str, str] = {}
+    from cosim.core.validation import assignments
+
     for name, column in assignments(texts or [], "--column", "NAME=COLUMN", CosimError):
         if name in columns:
             raise CosimError(f"--column {name} is given twice")

@@ -78,7 +78,7 @@ def test_the_estimate_is_that_of_plain_generalised_least_squares(features, rng):
 
 def sample(inputs, outputs):
     return SimpleNamespace(
-        s=inputs[:2], a=inputs[2:], next_s=outputs[:2], stage_cost=float(outputs[2])
+        s=inputs[:2], a=inputs[2:], next_s=outputs[:2], stage_cost=float(outputs[2]), number=0
     )
 
 

@@ -260,10 +260,11 @@ class Trajectory(Result):
         Args:
             width: in inches; by default that of two columns of a journal.
         """
-        from cosim.figures.style import WIDTH  # noqa: PLC0415 - matplotlib
-        from cosim.figures.trajectory import trajectory_figure  # noqa: PLC0415
+        from cosim.figures.trajectory import trajectory_figure  # noqa: PLC0415 - matplotlib
 
-        return trajectory_figure(self, self.scenario, width=width or WIDTH)
+        if width is None:
+            return trajectory_figure(self, self.scenario)
+        return trajectory_figure(self, self.scenario, width=width)
 
     @property
     def time(self) -> Array:

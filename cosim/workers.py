@@ -358,20 +358,23 @@ def _in_processes(
     )
     try:
         numbers: dict[Any, int] = {}
+        # Not `loky.wait`: it holds the locks of all futures, and an interruption there would leave
+        # them held, for which the shutdown below waits without end.
+        ended: SimpleQueue[Any] = SimpleQueue()
         # The workers start with the first item that is given out.
         with without_interrupts():
             for number, (key, item) in enumerate(items.items()):
                 tell = partial(_write_on_board, board.path, number)
                 future = workers.submit(_with_key, key, item, tell)
                 numbers[future] = number
-        running = set(numbers)
-        while running:
-            ended, running = loky.wait(
-                running,
-                timeout=LOOK_SECONDS,
-                return_when=loky.FIRST_COMPLETED,
-            )
-            for future in ended:
+                future.add_done_callback(ended.put)
+        n_running = len(numbers)
+        while n_running:
+            future = None
+            with suppress(Empty):
+                future = ended.get(timeout=LOOK_SECONDS)
+            if future is not None:
+                n_running -= 1
                 board.clear(numbers[future])
                 yield future.result()
             progress(board.total())

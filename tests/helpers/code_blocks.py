@@ -49,7 +49,6 @@ COVERED = {
 # done and feeds the next one. What comes out of a whole budget has its own tests.
 SMALLER = {
     "naive,tuned,optimal,": "naive,tuned,",
-    "naive,cautious,learned": "naive,learned",
     "--seeds 20 --steps 1000": "--seeds 2 --steps 100",
     "--seeds 3 --steps 1000": "--seeds 2 --steps 200",
     "--seeds 4 --steps 500": "--seeds 2 --steps 300",

@@ -296,7 +296,7 @@ def test_a_poor_start_is_bettered_and_the_plant_agrees(tmp_path, paper, algorith
 
 @pytest.mark.slow
 def test_a_log_that_cannot_tell_keeps_the_start(tmp_path, paper):
-    data = log_of(paper, build_controller("lqr", paper), 300, tmp_path)
+    data = log_of(paper, build_controller("lqr", paper), 130, tmp_path)
     unpriced = replace(data, stage_cost=None)
     answer = train_from_data("model-based", unpriced, paper, start="cautious", settings=QUICK)
     assert answer.verdict == "cannot tell"

@@ -13,6 +13,7 @@ from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming import Optimum, RoundProgress
+    from controllers.dynamic_programming.periodic import PeriodicOptimum
     from controllers.optimum import QuasiStaticPolicy
 
 
@@ -87,7 +88,7 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
     if task.signals:
         return _solve_periodic(task, refine, recompute, out_)
     from controllers import optimum as store
-    from controllers.dynamic_programming import GainEstimate, Settings, certify, objection, solve
+    from controllers.dynamic_programming import Settings, certify, solve
     from controllers.problem import PlantProblem
 
     plant = PlantProblem.from_scenario(task)
@@ -106,42 +107,15 @@ def _solve(task: cosim.Scenario, refine: bool, recompute: bool, out_: cli.Output
         solution = certify(plant, settings, solution, progress=show)
     if path is None:
         path = store.keep(key, solution)
-    certificate = solution.certificate
-    why_not: str | None = "no certificate; make one with --refine"
-    if certificate:
-        why_not = objection(certificate)
+    why_not = _objection(solution)
     # A memory that no controller sees outweighs any agreement of the figures.
     if plant.unseen:
         why_not = (
             f"its policy knows what {plant.unseen} was in the sample before, which no controller "
             "is told: a bound from below"
         )
-    kind = "reference" if why_not else "optimum"
-    own_gain = GainEstimate("solution", solution.gain, solution.lower, solution.upper)
-    estimates = certificate or [own_gain]
-    rows = []
-    for name, *numbers in estimates:
-        cells = [f"{number:.4f}" for number in numbers]
-        rows.append((name, *cells))
-    sizes = [str(count) for count in solution.grid.shape]
-    states = " × ".join(sizes)
-    title = f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states"
-    out_.table(title, ("", "J", "from", "to"), rows)
-    if why_not is not None:
-        out_.note(f"not called J*: {why_not}")
-    return {
-        "scenario": task.name,
-        "kind": kind,
-        "objection": why_not,
-        "J": solution.gain,
-        "lower": solution.lower,
-        "upper": solution.upper,
-        "edge_mass": solution.edge_mass,
-        "file": str(path),
-        "certificate": [figure._asdict() for figure in certificate] or None,
-        "states": solution.grid.shape,
-        "accuracy": asdict(solution.accuracy),
-    }
+    document = _show_solution(task, solution, path, why_not, out_)
+    return document | {"edge_mass": solution.edge_mass}
 
 
 def _solve_periodic(
@@ -152,7 +126,7 @@ def _solve_periodic(
 ) -> dict[str, Any]:
     """The same of a scenario with signals; says first what it takes."""
     from controllers import periodic_optimum as store
-    from controllers.dynamic_programming import GainEstimate, Settings, objection
+    from controllers.dynamic_programming import Settings
     from controllers.dynamic_programming.periodic import certify_periodic, solve_periodic
     from controllers.optimum import stored_file
 
@@ -174,10 +148,45 @@ def _solve_periodic(
     if refine:
         solution = certify_periodic(periodic, settings, solution, progress=out_.note)
         path = store.keep_periodic(key, periodic, solution)
+    document = _show_solution(
+        task, solution, path, _objection(solution), out_, f" in {periodic.period} phases"
+    )
+    return document | {"phases": periodic.period}
+
+
+def _objection(solution: Optimum | PeriodicOptimum) -> str | None:
+    """Why the gain of a solution is not called J*; None where it is."""
+    from controllers.dynamic_programming import objection
+
+    if solution.certificate:
+        return objection(solution.certificate)
+    return "no certificate; make one with --refine"
+
+
+def _show_solution(
+    task: cosim.Scenario,
+    solution: Optimum | PeriodicOptimum,
+    path: Path,
+    why_not: str | None,
+    out_: cli.Output,
+    phases: str = "",
+) -> dict[str, Any]:
+    """Print a solution's estimates of J*.
+
+    Args:
+        task: Its scenario.
+        solution: The solution.
+        path: Its file.
+        why_not: Why its gain is not called J*; None where it is.
+        out_: Where it is printed.
+        phases: Words of the title behind the number of states.
+
+    Returns:
+        What the JSON document has of a solution of any kind.
+    """
+    from controllers.dynamic_programming import GainEstimate
+
     certificate = solution.certificate
-    why_not: str | None = "no certificate; make one with --refine"
-    if certificate:
-        why_not = objection(certificate)
     kind = "reference" if why_not else "optimum"
     own_gain = GainEstimate("solution", solution.gain, solution.lower, solution.upper)
     rows = []
@@ -186,10 +195,7 @@ def _solve_periodic(
         rows.append((name, *cells))
     sizes = [str(count) for count in solution.grid.shape]
     states = " × ".join(sizes)
-    title = (
-        f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states in "
-        f"{periodic.period} phases"
-    )
+    title = f"{kind} of {task.name}: J = {solution.gain:.4f} on {states} states{phases}"
     out_.table(title, ("", "J", "from", "to"), rows)
     if why_not is not None:
         out_.note(f"not called J*: {why_not}")
@@ -203,7 +209,6 @@ def _solve_periodic(
         "file": str(path),
         "certificate": [figure._asdict() for figure in certificate] or None,
         "states": solution.grid.shape,
-        "phases": periodic.period,
         "accuracy": asdict(solution.accuracy),
     }
 

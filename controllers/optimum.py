@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import isfinite, modf
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from controllers.dynamic_programming import (
     Accuracy,
@@ -26,6 +26,7 @@ from controllers.dynamic_programming import (
     Settings,
     solve,
 )
+from controllers.dynamic_programming.periodic import PeriodicOptimum
 from controllers.errors import OptimumError, QpError
 from controllers.functions import COMPILED, INTERPRETED, LONG, worth_compiling
 from controllers.model import Model
@@ -34,6 +35,8 @@ from controllers.problem import VECTORS, PlantProblem, load_model
 from cosim.core.files import cache_folder, read_arrays, write_atomically
 from cosim.core.protocols import CompiledLoop, Decision, Vector
 from cosim.core.scenario import ChangeTable, Scenario
+
+Solution = TypeVar("Solution", Optimum, PeriodicOptimum)
 
 SOLVER_VERSION = 2
 """Part of every key; to be raised when the solver's results change."""
@@ -137,27 +140,56 @@ def write_optimum(
         optimum: The solution.
         key: The problem's `optimum_key`, which the file holds too.
     """
+    document = {**solution_document(optimum, key), "smooth": optimum.grid.smooth}
+    arrays = {
+        "actions": optimum.actions,
+        "W": optimum.W,
+        "distribution": optimum.distribution,
+    }
+    return write_solution(path, optimum.grid, arrays, document)
+
+
+def solution_document(optimum: Optimum | PeriodicOptimum, key: str) -> dict[str, Any]:
+    """What a file says of a solution of any kind, beside its arrays.
+
+    Args:
+        optimum: The solution.
+        key: The problem's key, which tells a file that was renamed.
+    """
     certificate = [estimate._asdict() for estimate in optimum.certificate]
-    document = {
+    return {
         "key": key,
         "gain": optimum.gain,
         "lower": optimum.lower,
         "upper": optimum.upper,
         "accuracy": asdict(optimum.accuracy),
-        "smooth": optimum.grid.smooth,
         "certificate": certificate or None,
     }
-    arrays: dict[str, Any] = {}
-    for i, axis in enumerate(optimum.grid.axes):
-        arrays[f"axis_{i}"] = axis
-    arrays["actions"] = optimum.actions
-    arrays["W"] = optimum.W
-    arrays["distribution"] = optimum.distribution
-    text = json.dumps(document, sort_keys=True)
-    arrays["document"] = np.array(text)
+
+
+def write_solution(
+    path: Path,
+    grid: Grid,
+    arrays: Mapping[str, NDArray[Any]],
+    document: Mapping[str, Any],
+) -> Path:
+    """Write a solution as a compressed .npz; equal content gives equal bytes.
+
+    Args:
+        path: The file.
+        grid: Of the states.
+        arrays: By name, beside the grid's axes.
+        document: All else, for JSON.
+
+    Returns:
+        The file.
+    """
+    content: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(grid.axes)}
+    content.update(arrays)
+    content["document"] = np.array(json.dumps(document, sort_keys=True))
     # Through memory, so that the file appears whole or not at all.
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    np.savez_compressed(buffer, **content)
     return write_atomically(path, buffer.getvalue())
 
 
@@ -171,13 +203,34 @@ def read_optimum(path: Path, key: str) -> Optimum:
     Raises:
         OptimumError: The file is damaged, or another problem's.
     """
+    return read_solution(path, key, _optimum_of)
+
+
+def read_solution(
+    path: Path,
+    key: str,
+    build: Callable[[Mapping[str, Any], Mapping[str, Any]], Solution],
+) -> Solution:
+    """Read what `write_solution` wrote.
+
+    Args:
+        path: The file.
+        key: The key that its document must have.
+        build: Makes the solution of arrays and document.
+
+    Returns:
+        The solution.
+
+    Raises:
+        OptimumError: The file is damaged, or another problem's.
+    """
     try:
         arrays = read_arrays(path)
         document = json.loads(str(arrays.pop("document")))
         # A file may have been renamed, and then it is another problem's.
         if document["key"] != key:
             raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
-        return _optimum_of(arrays, document)
+        return build(arrays, document)
     except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
         raise OptimumError(
             f"{path}: not a readable optimal policy ({error}); delete it to have the policy "
@@ -185,34 +238,47 @@ def read_optimum(path: Path, key: str) -> Optimum:
         ) from error
 
 
-def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optimum:
-    """The optimum in a file's arrays and document."""
+def solution_fields(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
+    """What `solution_document` and the grid's axes give of a solution, by its attributes.
+
+    Args:
+        arrays: Of a file.
+        document: The file's.
+    """
     axis_names = [name for name in arrays if name.startswith("axis_")]
     axes = [arrays[f"axis_{i}"] for i in range(len(axis_names))]
-    # JSON has lists for tuples, and may have a whole number for a float.
+    accuracy = document["accuracy"]
+    estimates = document["certificate"] or ()
+    certificate = [GainEstimate(**estimate) for estimate in estimates]
+    return {
+        "grid": Grid(tuple(axes)),
+        "gain": float(document["gain"]),
+        "lower": float(document["lower"]),
+        "upper": float(document["upper"]),
+        # JSON has lists for tuples, and may have a whole number for a float.
+        "accuracy": Accuracy(
+            substeps=int(accuracy["substeps"]),
+            nodes=tuple(accuracy["nodes"]),
+            penalty_nodes=tuple(accuracy["penalty_nodes"]),
+        ),
+        "certificate": tuple(certificate),
+    }
+
+
+def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optimum:
+    """The optimum in a file's arrays and document."""
+    fields = solution_fields(arrays, document)
     smooth = document["smooth"]
     if smooth:
         intervals = []
         for first, last in smooth:
             intervals.append((float(first), float(last)))
-        smooth = tuple(intervals)
-    accuracy = document["accuracy"]
-    estimates = document["certificate"] or ()
-    certificate = [GainEstimate(**estimate) for estimate in estimates]
+        fields["grid"] = Grid(fields["grid"].axes, tuple(intervals))
     return Optimum(
-        Grid(tuple(axes), smooth),
         actions=arrays["actions"],
         W=arrays["W"],
         distribution=arrays["distribution"],
-        gain=float(document["gain"]),
-        accuracy=Accuracy(
-            substeps=int(accuracy["substeps"]),
-            nodes=tuple(accuracy["nodes"]),
-            penalty_nodes=tuple(accuracy["penalty_nodes"]),
-        ),
-        lower=float(document["lower"]),
-        upper=float(document["upper"]),
-        certificate=tuple(certificate),
+        **fields,
     )
 
 

@@ -6,9 +6,8 @@ It knows the whole period: under a preview that is shorter, or none, J* is a bou
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-from dataclasses import asdict
+from collections.abc import Mapping
 from math import isfinite
 from pathlib import Path
 from time import perf_counter
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.dynamic_programming import Accuracy, BellmanOperator, GainEstimate, Grid, Settings
+from controllers.dynamic_programming import BellmanOperator, Grid, Settings
 from controllers.dynamic_programming.periodic import (
     PeriodicOptimum,
     PeriodicPlant,
@@ -26,11 +25,19 @@ from controllers.dynamic_programming.periodic import (
 )
 from controllers.errors import ModelError, OptimumError, QpError
 from controllers.model import Model
-from controllers.optimum import change_of, optimum_key, stored_file
+from controllers.optimum import (
+    change_of,
+    optimum_key,
+    read_solution,
+    solution_document,
+    solution_fields,
+    stored_file,
+    write_solution,
+)
 from controllers.policy_table import PolicyTable
 from controllers.problem import PlantProblem
 from controllers.varying import is_price
-from cosim.core.files import cache_folder, read_arrays, write_atomically
+from cosim.core.files import cache_folder
 from cosim.core.protocols import Array, Decision
 from cosim.core.scenario import Scenario, SignalTable
 from cosim.core.signals import Signals, period_of
@@ -156,23 +163,15 @@ def keep_periodic(key: str, periodic: PeriodicPlant, optimum: PeriodicOptimum) -
     action_step = (problem.action_upper - problem.action_lower) / ACTION_STEPS
     value_step = abs(optimum.gain) * VALUE_STEP or 1.0
     document = {
-        "key": key,
+        **solution_document(optimum, key),
         "action_step": action_step.tolist(),
         "value_step": value_step,
-        "gain": optimum.gain,
-        "lower": optimum.lower,
-        "upper": optimum.upper,
-        "accuracy": asdict(optimum.accuracy),
-        "certificate": [estimate._asdict() for estimate in optimum.certificate],
     }
-    arrays: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(optimum.grid.axes)}
-    arrays["action_changes"] = _changes(optimum.actions / action_step)
-    arrays["value_changes"] = _changes(optimum.W / value_step)
-    arrays["document"] = np.array(json.dumps(document, sort_keys=True))
-    # Through memory, so that the file appears whole or not at all.
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    return write_atomically(cache_folder("optima") / f"{key}.npz", buffer.getvalue())
+    arrays = {
+        "action_changes": _changes(optimum.actions / action_step),
+        "value_changes": _changes(optimum.W / value_step),
+    }
+    return write_solution(cache_folder("optima") / f"{key}.npz", optimum.grid, arrays, document)
 
 
 def _changes(values: Array) -> NDArray[np.int32]:
@@ -196,33 +195,19 @@ def read_periodic(path: Path, key: str) -> PeriodicOptimum:
     Raises:
         OptimumError: The file is damaged, or another problem's.
     """
-    try:
-        arrays = read_arrays(path)
-        document = json.loads(str(arrays.pop("document")))
-        if document["key"] != key:
-            raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
-        axis_names = [name for name in arrays if name.startswith("axis_")]
-        axes = [arrays[f"axis_{i}"] for i in range(len(axis_names))]
-        accuracy = document["accuracy"]
-        return PeriodicOptimum(
-            grid=Grid(tuple(axes)),
-            actions=_along(arrays["action_changes"]) * np.array(document["action_step"]),
-            W=_along(arrays["value_changes"]) * float(document["value_step"]),
-            gain=float(document["gain"]),
-            lower=float(document["lower"]),
-            upper=float(document["upper"]),
-            accuracy=Accuracy(
-                substeps=int(accuracy["substeps"]),
-                nodes=tuple(accuracy["nodes"]),
-                penalty_nodes=tuple(accuracy["penalty_nodes"]),
-            ),
-            certificate=tuple(GainEstimate(**entry) for entry in document["certificate"]),
-        )
-    except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
-        raise OptimumError(
-            f"{path}: not a readable optimal policy ({error}); delete it to have the policy "
-            "computed anew"
-        ) from error
+    return read_solution(path, key, _periodic_optimum_of)
+
+
+def _periodic_optimum_of(
+    arrays: Mapping[str, Any],
+    document: Mapping[str, Any],
+) -> PeriodicOptimum:
+    """The solution in a file's arrays and document."""
+    return PeriodicOptimum(
+        actions=_along(arrays["action_changes"]) * np.array(document["action_step"]),
+        W=_along(arrays["value_changes"]) * float(document["value_step"]),
+        **solution_fields(arrays, document),
+    )
 
 
 def periodic_is_stored(scenario: Scenario) -> bool:

@@ -11,8 +11,7 @@ from math import floor, isfinite, log10, nan
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri, stdtrit
+from scipy.special import stdtrit
 
 from cosim.core.protocols import Array
 
@@ -96,14 +95,16 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
     if _all_equal(without_one, value):
         return value, value
 
-    def quotients(drawn: NDArray[Any]) -> Any:
-        return np.mean(numerator[drawn], axis=-1) / np.mean(denominator[drawn], axis=-1)
+    def quotient(
+        above: Array,
+        below: Array,
+        axis: int,
+    ) -> Any:
+        mean_above = np.mean(above, axis=axis)
+        mean_below = np.mean(below, axis=axis)
+        return mean_above / mean_below
 
-    every_seed = np.arange(seeds)
-    resampled = _resample([every_seed], quotients)
-    # Computed as the resamples are: few seeds often give the same sample once more.
-    same = float(quotients(every_seed))
-    return _bca_interval(resampled, same, without_one)
+    return _bootstrap((numerator, denominator), quotient, paired=True, method="BCa")
 
 
 def _all_equal(values: Array, level: float) -> bool:
@@ -112,59 +113,27 @@ def _all_equal(values: Array, level: float) -> bool:
     return bool(np.ptp(values) <= NEGLIGIBLE * scale)
 
 
-def _resample(data: Sequence[NDArray[Any]], statistic: Callable[..., Any]) -> Array:
-    """A statistic of data that are drawn anew with replacement, (RESAMPLES,), with a fixed seed.
+def _bootstrap(data: Sequence[Array], statistic: Callable[..., Any], **options: Any) -> Interval:
+    """Interval of a statistic of resampled data, with a fixed seed."""
+    from scipy import stats  # noqa: PLC0415 - most of a second
 
-    The draws are those of `scipy.stats.bootstrap`, whose import takes most of a second.
-
-    Args:
-        data: the samples, each of which is drawn from by itself, (S_i,).
-        statistic: takes an array (K, S_i) of draws of each sample, and returns K values.
-    """
-    # The same table has the same interval, whoever makes it.
-    rng = np.random.default_rng(0)
-    # A batch of draws is in the memory at once.
+    # SciPy draws a batch of resamples at once, and keeps it: a limit of the memory.
     longest = max(len(values) for values in data)
     batch = max(1, AT_ONCE // longest)
-    parts = []
-    for first in range(0, RESAMPLES, batch):
-        n_draws = min(batch, RESAMPLES - first)
-        resamples = []
-        for values in data:
-            count = len(values)
-            drawn = rng.integers(0, count, (n_draws, count))
-            resamples.append(values[drawn])
-        parts.append(statistic(*resamples))
-    return np.concatenate(parts)
-
-
-def _bca_interval(resampled: Array, value: float, without_one: Array) -> Interval:
-    """Bias-corrected and accelerated bootstrap interval.
-
-    Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, eqs. 14.9 to 14.15.
-
-    Args:
-        resampled: the statistic of each resample, (B,).
-        value: the statistic of the sample.
-        without_one: the statistic of the sample without each of its S members, (S,).
-
-    Returns:
-        None where all resamples lie on one side of the value.
-    """
-    below = np.mean(resampled < value)
-    not_above = np.mean(resampled <= value)
-    share = (below + not_above) / 2
-    if not 0 < share < 1:
+    result = stats.bootstrap(
+        tuple(data),
+        statistic,
+        n_resamples=RESAMPLES,
+        batch=batch,
+        confidence_level=LEVEL,
+        # The same table has the same interval, whoever makes it.
+        rng=np.random.default_rng(0),
+        **options,
+    )
+    low, high = result.confidence_interval
+    # BCa has none where all resamples lie on one side of the value.
+    if not (isfinite(low) and isfinite(high)):
         return None
-    bias = ndtri(share)
-    differences = np.mean(without_one) - without_one
-    squares = np.sum(differences**2)
-    acceleration = np.sum(differences**3) / (6 * squares**1.5)
-    levels = []
-    for quantile in (ndtri(0.5 - LEVEL / 2), ndtri(0.5 + LEVEL / 2)):
-        shifted = bias + quantile
-        levels.append(ndtr(bias + shifted / (1 - acceleration * shifted)))
-    low, high = np.quantile(resampled, levels)
     return float(low), float(high)
 
 
@@ -321,14 +290,12 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
     if every_run_equal:
         return Estimate(value, (value, value))
 
-    def middle(*resampled: Array) -> Array:
-        drawn = np.concatenate(resampled, axis=-1)
-        means: Array = interquartile_mean(drawn)
-        return means
+    def middle(*resampled: Array, axis: int) -> Any:
+        drawn = np.concatenate(resampled, axis=axis)
+        return interquartile_mean(drawn, axis)
 
-    levels = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
-    low, high = np.quantile(_resample(strata, middle), levels)
-    return Estimate(value, (float(low), float(high)))
+    interval = _bootstrap(strata, middle, method="percentile")
+    return Estimate(value, interval)
 
 
 def td_error_mean(

@@ -105,12 +105,10 @@ class _Errors(NamedTuple):
     Attributes:
         errors: (M, n).
         rounding: their least deviations, (M, n).
-        sizes: h, (M, n).
     """
 
     errors: Array
     rounding: Array
-    sizes: Array
 
     def centred(self) -> _Errors:
         """The same with errors of mean zero."""
@@ -130,20 +128,42 @@ class _Errors(NamedTuple):
         return float(-count * logarithm / 2)
 
 
-def _nominal_errors(
-    features: Features,
-    states: Array,
-    actions: Array,
-    next_states: Array,
-) -> _Errors:
-    """Errors of the nominal model's states; states (M, n), actions (M, m), next states (M, n)."""
-    n = states.shape[1]
-    y, h = _nominal(features, np.column_stack([states, actions]))
+class _Reading(NamedTuple):
+    """M transitions as one reading of the log has them.
+
+    Attributes:
+        states: (M, n).
+        actions: (M, m).
+        next_states: (M, n).
+    """
+
+    states: Array
+    actions: Array
+    next_states: Array
+
+
+def _errors_at(features: Features, reading: _Reading, c: Array) -> tuple[_Errors, Array]:
+    """Errors of a model's states in a reading, and their derivatives by its parameters, (M, n, p).
+
+    Args:
+        features: the nominal model.
+        reading: transitions.
+        c: errors of the parameters, (p,).
+    """
+    n = reading.states.shape[1]
+    inputs = np.column_stack([reading.states, reading.actions])
+    y, G, h = features(inputs, c)
     sizes = h[:, :n]
     predicted = y[:, :n]
-    errors = (next_states - predicted) / sizes
+    errors = (reading.next_states - predicted) / sizes
     rounding = INTEGRATION_ERROR * np.abs(predicted) / sizes
-    return _Errors(errors, rounding, sizes)
+    return _Errors(errors, rounding), G[:, :n] / sizes[:, :, None]
+
+
+def _nominal_errors(features: Features, reading: _Reading) -> _Errors:
+    """Errors of the nominal model's states."""
+    errors, _ = _errors_at(features, reading, np.zeros(features.n_parameters))
+    return errors
 
 
 def _check_order(
@@ -163,21 +183,25 @@ def _check_order(
     rows = _unbroken_rows(data, settings.largest_shift)
     if len(rows) < 10 * features.n_outputs:
         return
-    states = data.states[rows]
-    actions = data.actions[rows]
-    next_states = data.next_states[rows]
-    as_it_is = _nominal_errors(features, states, actions, next_states)
+    as_it_is = _Reading(data.states[rows], data.actions[rows], data.next_states[rows])
 
     # A shift leaves the mean error as it is, which is the plant's own.
     gains = {}
-    centred_likelihood = as_it_is.centred().log_likelihood()
+    centred_likelihood = _nominal_errors(features, as_it_is).centred().log_likelihood()
     for shift in _shifts(settings.largest_shift):
-        shifted = data.actions[rows + shift]
-        reading = _nominal_errors(features, states, shifted, next_states).centred()
-        gains[_in_words(shift)] = reading.log_likelihood() - centred_likelihood
+        shifted = as_it_is._replace(actions=data.actions[rows + shift])
+        errors = _nominal_errors(features, shifted).centred()
+        gains[_in_words(shift)] = errors.log_likelihood() - centred_likelihood
     # Exchanged columns have another mean, and may make the model's states stand still: it counts.
     thinning = max(len(rows) // model_settings.fit_samples, 1)
-    as_logged = _Reading(states[::thinning], actions[::thinning], next_states[::thinning])
+    as_logged = _Reading(*(columns[::thinning] for columns in as_it_is))
+
+    def likelihoods(reading: _Reading) -> tuple[float, float]:
+        """Of the nominal model, and of the best of it and the fitted ones."""
+        fits = [fit.log_likelihood() for fit in _fits(features, reading, model_settings)]
+        return fits[0], max(fits)
+
+    nominal_likelihood, best_likelihood = likelihoods(as_logged)
 
     def gain_of(reading: _Reading) -> float:
         """By how many nats the model explains this reading better than the log as it is.
@@ -185,13 +209,8 @@ def _check_order(
         The least of the nominal model's and of the fitted one's: two inputs of nearly one size may
         undo an error of a parameter, and parameters that are fitted may explain a wrong unit.
         """
-        gains_of_rounds = []
-        for rounds in (1, model_settings.fit_rounds):
-            as_read = _fitted(features, reading, model_settings, rounds)
-            as_it_stands = _fitted(features, as_logged, model_settings, rounds)
-            gain = as_read.log_likelihood() - as_it_stands.log_likelihood()
-            gains_of_rounds.append(gain)
-        return min(gains_of_rounds)
+        nominal, best = likelihoods(reading)
+        return min(nominal - nominal_likelihood, best - best_likelihood)
 
     plant = scenario.plant
     for one, other in combinations(range(len(plant.actions)), 2):
@@ -214,56 +233,34 @@ def _check_order(
         )
 
 
-class _Reading(NamedTuple):
-    """M transitions as one reading of the log has them.
-
-    Attributes:
-        states: (M, n).
-        actions: (M, m).
-        next_states: (M, n).
-    """
-
-    states: Array
-    actions: Array
-    next_states: Array
-
-
-def _fitted(
+def _fits(
     features: Features,
     reading: _Reading,
     settings: EmpiricalModelConfiguration,
-    rounds: int,
-) -> _Errors:
-    """Errors of the model whose parameters fit a reading best.
+) -> list[_Errors]:
+    """Errors of the nominal model, and of those whose parameters are fitted to a reading.
 
     Args:
         features: the nominal model.
         reading: transitions.
-        settings: prior of the parameters' errors.
-        rounds: number of fits, the first of which is the nominal model.
+        settings: prior of the parameters' errors, and the number of fits.
     """
-    inputs = np.column_stack([reading.states, reading.actions])
-    n = reading.states.shape[1]
     c: Array = np.zeros(features.n_parameters)
     precision = np.eye(len(c)) / settings.parameter_deviation**2
-    fits = []
-    for _ in range(rounds):
-        y, G, h = features(inputs, c)
-        sizes = h[:, :n]
-        errors = (reading.next_states - y[:, :n]) / sizes
-        rounding = INTEGRATION_ERROR * np.abs(y[:, :n]) / sizes
-        fit = _Errors(errors, rounding, sizes)
-        fits.append(fit)
+    largest = settings.largest_parameter_error
+    nominal, design = _errors_at(features, reading, c)
+    fits = [nominal]
+    for _ in range(settings.fit_rounds - 1):
         # One Gauss-Newton step, each output weighted as it errs.
-        design = G[:, :n] / sizes[:, :, None]
-        target = errors + design @ c
-        weighted = np.linalg.solve(fit.covariance, design)
+        target = fits[-1].errors + design @ c
+        weighted = np.linalg.solve(fits[-1].covariance, design)
         normal = np.tensordot(weighted, design, axes=((0, 1), (0, 1)))
         moment = np.tensordot(weighted, target, axes=((0, 1), (0, 1)))
         solution = np.linalg.solve(normal + precision, moment)
-        largest = settings.largest_parameter_error
         c = np.asarray(solution.clip(-largest, largest))
-    return max(fits, key=_Errors.log_likelihood)
+        fit, design = _errors_at(features, reading, c)
+        fits.append(fit)
+    return fits
 
 
 def _unbroken_rows(data: LoggedData, reach: int) -> NDArray[np.intp]:
@@ -356,7 +353,8 @@ def _there_and_back(
 
     A disturbance of the plant, be it as large, does not jump back by itself.
     """
-    nominal = _nominal_errors(features, data.states, data.actions, data.next_states)
+    as_it_is = _Reading(data.states, data.actions, data.next_states)
+    nominal = _nominal_errors(features, as_it_is)
     centre = np.median(nominal.errors, axis=0)
     distance = np.abs(nominal.errors - centre)
     # The median's deviation is not moved by the jumps themselves; of a normal law it is the

@@ -10,6 +10,7 @@ import numpy as np
 
 from controllers.errors import ModelError
 from controllers.model import Model
+from cosim.core.protocols import Vector
 from cosim.core.scenario import Scenario, SignalTable
 from cosim.core.validation import instead
 
@@ -142,3 +143,15 @@ def of_kind(varying: Iterable[Varying], *kinds: VaryingKind) -> list[tuple[int, 
         kinds: The kinds that are wanted.
     """
     return [(row, item) for row, item in enumerate(varying) if item.kind in kinds]
+
+
+def hold_last(column: Vector, values: Vector) -> None:
+    """Fill the stages of the horizon with what is known of a signal; beyond that it keeps the last.
+
+    Args:
+        column: of the stages 0 … N, (N+1,), which is overwritten.
+        values: the present one and those that follow, as many as are known.
+    """
+    n_known = min(len(values), len(column))
+    column[:n_known] = values[:n_known]
+    column[n_known:] = values[-1]

@@ -6,19 +6,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.problem import Problem
-from controllers.varying import MODEL_KINDS, of_kind
+from controllers.varying import MODEL_KINDS, hold_last, of_kind
 from cosim.core.protocols import Array
 from cosim.core.scenario import Scenario
 from cosim.core.signals import Known, Signals, period_of
 from learning.algorithm import Transition
 from learning.checkpoint import State
 from learning.signal_costs import SignalCosts
-
-Numbers = NDArray[np.int64]
-"""Numbers of samples."""
 
 
 class SignalsOfSamples(NamedTuple):
@@ -62,9 +58,11 @@ class KnownSignals:
         self._signals = Signals(scenario)
         self._costs = SignalCosts(problem)
         self._model_rows: list[int] = []
+        self._model_signals: list[str] = []
         self._price_columns: list[int] = []
         for column, (row, item) in enumerate(of_kind(problem.varying, *MODEL_KINDS)):
             self._model_rows.append(row)
+            self._model_signals.append(item.signal)
             if item.kind == "price":
                 self._price_columns.append(column)
         # What is measured does not come again.
@@ -101,8 +99,7 @@ class KnownSignals:
         """
         if known is None:
             return np.empty(0)
-        items = of_kind(self._problem.varying, *MODEL_KINDS)
-        values = [known[item.signal][0] for _, item in items]
+        values = [known[signal][0] for signal in self._model_signals]
         return np.array(values, dtype=np.float64)
 
     def bounds(self, numbers: Sequence[int]) -> tuple[Array, Array]:
@@ -178,10 +175,7 @@ class KnownSignals:
         n_stages = self._problem.horizon + 1
         stages = np.empty((n_stages, len(self._problem.varying)))
         for row, item in enumerate(self._problem.varying):
-            values = known[item.signal][:n_stages]
-            stages[: len(values), row] = values
-            # Beyond the last known value the NMPC holds it.
-            stages[len(values) :, row] = values[-1]
+            hold_last(stages[:, row], known[item.signal])
         return stages
 
     def state_dict(self) -> State:

@@ -48,6 +48,7 @@ from controllers.sensitivities import (
 from controllers.stabilised import Stages, solve_stabilised
 from controllers.stage_symbols import nominal_given
 from controllers.theta import Parameters
+from controllers.varying import hold_last
 from cosim.core.protocols import CompiledLoop, Matrix, Vector
 from cosim.core.scenario import Scenario
 
@@ -917,7 +918,6 @@ class RtiNmpc:
         """
         if not self._signal_columns:
             return
-        n_stages = self.problem.horizon + 1
         for signal, column in self._signal_columns:
             values = known.get(signal)
             if values is None:
@@ -927,12 +927,7 @@ class RtiNmpc:
                 raise ControllerError(
                     f"signal '{signal}' must be known by finite values, its present one first"
                 )
-            n_known = len(values)
-            if n_known >= n_stages:
-                column[:] = values[:n_stages]
-            else:
-                column[:n_known] = values
-                column[n_known:] = values[-1]
+            hold_last(column, values)
         # The last preparation is of other values.
         self._prepared = None
 

@@ -36,7 +36,7 @@ from cosim.core.files import cache_folder, read_arrays, write_atomically
 from cosim.core.protocols import CompiledLoop, Decision, Vector
 from cosim.core.scenario import ChangeTable, Scenario
 
-Solution = TypeVar("Solution", Optimum, PeriodicOptimum)
+AnyOptimum = TypeVar("AnyOptimum", Optimum, PeriodicOptimum)
 
 SOLVER_VERSION = 2
 """Part of every key; to be raised when the solver's results change."""
@@ -209,8 +209,8 @@ def read_optimum(path: Path, key: str) -> Optimum:
 def read_solution(
     path: Path,
     key: str,
-    build: Callable[[Mapping[str, Any], Mapping[str, Any]], Solution],
-) -> Solution:
+    build: Callable[[Mapping[str, Any], Mapping[str, Any]], AnyOptimum],
+) -> AnyOptimum:
     """Read what `write_solution` wrote.
 
     Args:

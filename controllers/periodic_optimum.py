@@ -20,7 +20,7 @@ from controllers.dynamic_programming import BellmanOperator, Grid, Settings
 from controllers.dynamic_programming.periodic import (
     PeriodicOptimum,
     PeriodicPlant,
-    Progress,
+    StepProgress,
     solve_periodic,
 )
 from controllers.errors import ModelError, OptimumError, QpError
@@ -278,7 +278,7 @@ class PeriodicPolicy:
         cls,
         scenario: Scenario,
         *,
-        progress: Progress | None = None,
+        progress: StepProgress | None = None,
     ) -> PeriodicPolicy:
         """Policy of a scenario with signals: stored, or solved now and kept.
 

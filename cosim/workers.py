@@ -34,7 +34,7 @@ WORKER_SECONDS = 300.0
 """Time for which a cluster may be without a worker while there is work."""
 ROUNDS = 3
 """Times that workers may die without having finished one item."""
-LOOK_SECONDS = 1.0
+PROGRESS_SECONDS = 1.0
 """Seconds between two looks at how far workers have come."""
 SamplesDone = Callable[[int], None]
 """Called with a number of plant samples."""
@@ -173,7 +173,7 @@ def _paced(progress: SamplesDone) -> SamplesDone:
     def call(samples: int) -> None:
         nonlocal called_at
         now = time.perf_counter()
-        if now - called_at >= LOOK_SECONDS / 2:
+        if now - called_at >= PROGRESS_SECONDS / 2:
             called_at = now
             progress(samples)
 
@@ -372,7 +372,7 @@ def _in_processes(
         while n_running:
             future = None
             with suppress(Empty):
-                future = ended.get(timeout=LOOK_SECONDS)
+                future = ended.get(timeout=PROGRESS_SECONDS)
             if future is not None:
                 n_running -= 1
                 board.clear(numbers[future])

@@ -32,6 +32,7 @@ from cosim.core.simulation import functions_of, reporting, simulate
 from cosim.core.statistics import Estimate, shown
 from cosim.core.training_options import (
     CHECKPOINT,
+    CHECKPOINT_PAUSE,
     HELD_OUT,
     LOG,
     PARAMETERS,
@@ -60,8 +61,6 @@ TRAINING_FILES = (
     "training.rrd",
 )  # fmt: skip
 """Files of a training; all in a folder belong to one run."""
-PAUSE = 20
-"""Least time between two checkpoints of another's FMU, in multiples of the time that one takes."""
 REMARKS = {
     "J": "J",
     "greedy_J": "greedy J",
@@ -694,7 +693,7 @@ class _Session:
             self.loop.parameters.save(stage / PARAMETERS)
             self._save_state(stage / CHECKPOINT)
         end = time.perf_counter()
-        self._quiet_until = end + PAUSE * (end - begin)
+        self._quiet_until = end + CHECKPOINT_PAUSE * (end - begin)
 
     def _save_state(self, path: Path) -> None:
         """Write what resuming needs, where the plant can say its state."""

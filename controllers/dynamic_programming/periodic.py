@@ -60,7 +60,7 @@ MOST_PERIODS = 20
 BURN_IN = 300
 """Samples of a simulated path before it counts."""
 
-Progress = Callable[[str], None]
+StepProgress = Callable[[str], None]
 """Called with what has been done, in words."""
 
 
@@ -244,10 +244,14 @@ class _Sweep(NamedTuple):
     xi: Array
 
     @property
+    def added(self) -> Array:
+        """Mean cost per sample that the period adds to each grid state, (G,)."""
+        return np.asarray((self.W[0] - self.W[-1]) / len(self.xi))
+
+    @property
     def bounds(self) -> tuple[float, float]:
-        """Least and largest mean cost per sample that the period adds to any grid state."""
-        added = (self.W[0] - self.W[-1]) / len(self.xi)
-        return float(added.min()), float(added.max())
+        """Least and largest of these."""
+        return float(self.added.min()), float(self.added.max())
 
 
 def _sweep(nodes: Nodes, W: Array) -> _Sweep:
@@ -270,7 +274,7 @@ def solve_periodic(
     settings: Settings | None = None,
     *,
     workers: int = 2,
-    progress: Progress | None = None,
+    progress: StepProgress | None = None,
 ) -> PeriodicOptimum:
     """Solve for the optimal policy of each phase.
 
@@ -290,12 +294,12 @@ def solve_periodic(
     mean = replace(periodic.plant, parameters=periodic.parameters.mean(axis=0))
     accuracy = settings.accuracy(mean)
     still = draft_solution(BellmanOperator(mean, accuracy.draft(), workers=workers), settings)
-    _report(progress, f"still plant at the mean prices: about {still.gain:.1f}")
+    _tell(progress, f"still plant at the mean prices: about {still.gain:.1f}")
     draft = BellmanOperator(periodic.plant, accuracy.draft(), workers=workers)
     boxes, W = _find_boxes(periodic, draft, still, progress)
     operator = BellmanOperator(periodic.plant, accuracy, workers=workers)
     solution = _solved(periodic, operator, still.grid, W, boxes, settings)
-    _report(progress, f"{solution.lower:.3f} ≤ J* ≤ {solution.upper:.3f}")
+    _tell(progress, f"{solution.lower:.3f} ≤ J* ≤ {solution.upper:.3f}")
     return solution
 
 
@@ -303,7 +307,7 @@ def _find_boxes(
     periodic: PeriodicPlant,
     draft: BellmanOperator,
     still: Optimum,
-    progress: Progress | None,
+    progress: StepProgress | None,
 ) -> tuple[ActionBoxes, Array]:
     """Boxes of actions that hold the policy of all phases, and values (G,) at a period's begin.
 
@@ -326,7 +330,7 @@ def _find_boxes(
         sweep = _sweep(node_costs(periodic, draft, grid, boxes, DRAFT_NODES), W)
         W = sweep.W[0] - sweep.W[0].min()
         lower, upper = sweep.bounds
-        _report(progress, f"actions {number}: J between {lower:.1f} and {upper:.1f}")
+        _tell(progress, f"actions {number}: J between {lower:.1f} and {upper:.1f}")
         wider = _widened(periodic, boxes, sweep.xi, inside)
         if wider is None:
             return _tightened(periodic, boxes, sweep.xi, inside), W
@@ -347,7 +351,7 @@ def _solved(
     """The solution on a grid and in boxes of actions, from values W (G,)."""
     nodes = node_costs(periodic, operator, grid, boxes, ACTION_NODES)
     sweep = _converged(nodes, W, settings.tolerance, MOST_PERIODS)
-    return _accepted(periodic, operator, grid, sweep, boxes.points(sweep.xi))
+    return _differential(periodic, operator, grid, sweep, boxes.points(sweep.xi))
 
 
 def _converged(nodes: Nodes, W: Array, tolerance: float, most: int) -> _Sweep:
@@ -437,7 +441,7 @@ def _tightened(
     return _within_actuators(periodic, lower, upper)
 
 
-def _accepted(
+def _differential(
     periodic: PeriodicPlant,
     operator: BellmanOperator,
     grid: Grid,
@@ -445,9 +449,8 @@ def _accepted(
     actions: Array,
 ) -> PeriodicOptimum:
     """The optimum of a last sweep; raises OptimumError where its bounds are apart."""
-    added = (sweep.W[0] - sweep.W[-1]) / periodic.period
     anchor = grid.nearest(operator.problem.reference_state)
-    gain = float(added[anchor])
+    gain = float(sweep.added[anchor])
     lower, upper = sweep.bounds
     if upper - lower > 1e-3 * abs(gain):
         raise OptimumError(
@@ -476,7 +479,7 @@ def _within_actuators(periodic: PeriodicPlant, lower: Array, upper: Array) -> Ac
     )
 
 
-def _report(progress: Progress | None, words: str) -> None:
+def _tell(progress: StepProgress | None, words: str) -> None:
     """Say what has been done, where anybody asks."""
     if progress is not None:
         progress(words)
@@ -492,7 +495,7 @@ def certify_periodic(
     *,
     paths: int = 2000,
     periods: int = 3,
-    progress: Progress | None = None,
+    progress: StepProgress | None = None,
 ) -> PeriodicOptimum:
     """A solution with a certificate; the policy stays the given one.
 
@@ -509,9 +512,9 @@ def certify_periodic(
     """
     operator = BellmanOperator(periodic.plant, optimum.accuracy, workers=2)
     finer = _refinement(periodic, operator, optimum, settings)
-    _report(progress, f"refinement: {finer.lower:.3f} ≤ J* ≤ {finer.upper:.3f}")
+    _tell(progress, f"refinement: {finer.lower:.3f} ≤ J* ≤ {finer.upper:.3f}")
     mean, half_width = simulate_periodic(periodic, optimum, paths=paths, periods=periods)
-    _report(progress, f"simulation: {mean:.3f} ± {half_width:.3f}")
+    _tell(progress, f"simulation: {mean:.3f} ± {half_width:.3f}")
     certificate = (
         GainEstimate("solution", optimum.gain, optimum.lower, optimum.upper),
         GainEstimate("refinement", finer.gain, finer.lower, finer.upper),

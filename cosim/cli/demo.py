@@ -22,10 +22,10 @@ SCENARIO = "fouled"
 START = "cautious"
 """The untrained controller from which both rules start."""
 UNTRAINED = ("naive", "backed-off", START)
-RULES = ("q-learning", "model-based")
+LEARNING_RULES = ("q-learning", "model-based")
 BEST = "model-based"
 """The rule whose controller is drawn and recorded."""
-DAY = 1440
+DAY_SAMPLES = 1440
 """Samples of a day: one a minute."""
 COMPARED_RUNS = 10
 """Runs of the comparison; of the first the beginning is drawn and recorded."""
@@ -34,7 +34,7 @@ DRAWN = 300
 
 
 def demo(
-    samples: Annotated[int, typer.Option("--samples", "-n", min=100, max=1_000_000)] = DAY,
+    samples: Annotated[int, typer.Option("--samples", "-n", min=100, max=1_000_000)] = DAY_SAMPLES,
     steps: cli.StepsOption = 1000,
     seed: cli.SeedOption = 0,
     pairs: PairsOption = False,
@@ -76,7 +76,7 @@ def demo(
             for name in UNTRAINED:
                 untrained = cast("RtiNmpc", cosim.build_controller(name, scenario))
                 named[name] = str(untrained.parameters.save(work / f"{name}.toml"))
-            trained = _train(named[START], samples, seed, out_)
+            trained = _train_rules(named[START], samples, seed, out_)
             for name, training in trained.items():
                 named[name] = str(training.parameters.save(work / f"{name}.toml"))
             named["optimal"] = "optimal"
@@ -100,11 +100,11 @@ def demo(
                 record_training(files / "training.rrd", training)
             cli.write_summary(stage, summary)
         data = dict.fromkeys(UNTRAINED, "none")
-        for name in RULES:
+        for name in LEARNING_RULES:
             data[name] = f"{samples} samples"
         data["optimal"] = "the plant"
         show_evaluation(summary, out_, pairs, data)
-        for name in RULES:
+        for name in LEARNING_RULES:
             out_.note(_gain(summary, name, samples))
         # `make demo` activates no environment.
         command = "cosim" if shutil.which("cosim") else f"{sys.executable} -m cosim"
@@ -116,7 +116,7 @@ def demo(
         out_.json(summary)
 
 
-def _train(start: str, samples: int, seed: int, output: cli.Output) -> dict[str, Training]:
+def _train_rules(start: str, samples: int, seed: int, output: cli.Output) -> dict[str, Training]:
     """Train each rule on the same noise.
 
     Args:
@@ -129,7 +129,7 @@ def _train(start: str, samples: int, seed: int, output: cli.Output) -> dict[str,
     # Twelve rows of the log, and three points of the learning curve.
     log_every = max(1, samples // 12)
     evaluate_every = 4 * log_every
-    for rule in RULES:
+    for rule in LEARNING_RULES:
         training = cosim.train(
             rule,
             SCENARIO,

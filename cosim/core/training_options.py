@@ -26,6 +26,8 @@ SLOW_LOG_EVERY = 100
 """Samples a row of the log and a checkpoint, likewise, on a plant that may be slow: what a stop
 loses is a minute at most where a step takes half a second.
 """
+CHECKPOINT_PAUSE = 20
+"""Least time between two checkpoints of another's FMU, in multiples of the time that one takes."""
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 MOST = 100_000_000

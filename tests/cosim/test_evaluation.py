@@ -77,7 +77,7 @@ def test_few_samples_of_others_code_are_work_for_more_than_one_worker(paper, mon
 
 
 def test_progress_is_shown_within_a_run(paper, monkeypatch):
-    monkeypatch.setattr("cosim.workers.LOOK_SECONDS", 0.0)
+    monkeypatch.setattr("cosim.workers.PROGRESS_SECONDS", 0.0)
     shown = []
     evaluate(paper, {"hold": hold}, 2, 1000, progress=lambda n, *_: shown.append(n))
     assert {500, 1000, 1500} < set(shown) and shown == sorted(shown)

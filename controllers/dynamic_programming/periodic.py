@@ -351,7 +351,7 @@ def _solved(
     """The solution on a grid and in boxes of actions, from values W (G,)."""
     nodes = node_costs(periodic, operator, grid, boxes, ACTION_NODES)
     sweep = _converged(nodes, W, settings.tolerance, MOST_PERIODS)
-    return _differential(periodic, operator, grid, sweep, boxes.points(sweep.xi))
+    return _from_sweep(periodic, operator, grid, sweep, boxes.points(sweep.xi))
 
 
 def _converged(nodes: Nodes, W: Array, tolerance: float, most: int) -> _Sweep:
@@ -441,7 +441,7 @@ def _tightened(
     return _within_actuators(periodic, lower, upper)
 
 
-def _differential(
+def _from_sweep(
     periodic: PeriodicPlant,
     operator: BellmanOperator,
     grid: Grid,

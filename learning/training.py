@@ -40,7 +40,7 @@ from cosim.core.training_options import (
     with_training_options,
 )
 from cosim.plant import FmuPlant
-from cosim.plant.fmi import SHIPPED_FMUS
+from cosim.plant.fmi import steps_are_fast
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import State, part_of, prefixed
@@ -684,7 +684,7 @@ class _Session:
         if self.out is None:
             return
         begin = time.perf_counter()
-        is_fast = self.run.scenario.plant.fmu in SHIPPED_FMUS
+        is_fast = steps_are_fast(self.run.scenario.plant.fmu)
         if begin < self._quiet_until and not (is_fast or is_last):
             return
         # Nothing of another run may stay beside the files of this one.

@@ -37,7 +37,7 @@ from cosim.core.training_options import (
 from cosim.core.validation import suggestion
 from cosim.identity import depends_on
 from cosim.plant import FmuPlant
-from cosim.plant.fmi import SHIPPED_FMUS
+from cosim.plant.fmi import steps_are_fast
 from learning.algorithm import Algorithm, load_algorithm
 from learning.backed_off import add_reserve, back_off
 from learning.configuration import Configuration
@@ -182,7 +182,7 @@ def make_run(
     if samples is None:
         samples = getattr(rule, "budget", DEFAULT_SAMPLES)
     _check_samples(samples)
-    options = _with_intervals(options, is_fast=scenario.plant.fmu in SHIPPED_FMUS)
+    options = _with_intervals(options, is_fast=steps_are_fast(scenario.plant.fmu))
     options = _with_held_out_runs(options, scenario, samples)
     return TrainingRun(algorithm, scenario, samples, settings, **vars(options))
 
@@ -192,8 +192,7 @@ def _with_intervals(options: TrainingOptions, *, is_fast: bool) -> TrainingOptio
 
     Args:
         options: what was chosen.
-        is_fast: whether the plant is known to be fast. A rule by a clock would make the same
-            command give other digits: the solver starts afresh at a checkpoint.
+        is_fast: whether the plant is known to be fast.
     """
     _check_options(options)
     log_every = options.log_every
@@ -223,7 +222,7 @@ def _with_held_out_runs(
         return options
     # A part of a day says nothing of what the day costs.
     longest = _in_whole_periods(EVALUATION_STEPS, period_of(scenario) or 1)
-    if scenario.plant.fmu in SHIPPED_FMUS or not options.evaluation_seeds:
+    if steps_are_fast(scenario.plant.fmu) or not options.evaluation_seeds:
         return replace(options, evaluation_steps=longest)
     assert options.evaluate_every is not None
     evaluations = most_evaluations(samples, options.evaluate_every)

@@ -16,7 +16,7 @@ from cosim.core.training_options import HELD_OUT, OPTION_NAMES, SLOW_LOG_EVERY, 
 from cosim.core.validation import instead, validated
 from cosim.evaluation import NAIVE
 from cosim.measurement import Noise
-from cosim.plant.fmi import SHIPPED_FMUS
+from cosim.plant.fmi import steps_are_fast
 from cosim.studies.document import DEFAULT, CaseTable, SeedsTable, StudyTable, read
 from cosim.studies.grid import GridPoint, grid_points
 from cosim.studies.run import TrainingJob
@@ -328,7 +328,7 @@ class Study:
 
     def is_fast(self, scenario: str) -> bool:
         """Whether a scenario's plant is known to be fast; a step of another's FMU may take long."""
-        return self.scenarios[scenario].plant.fmu in SHIPPED_FMUS
+        return steps_are_fast(self.scenarios[scenario].plant.fmu)
 
     def draws_curves(self, scenario: str) -> bool:
         """Whether all trainings on a scenario have the greedy evaluations of `[curves]`.

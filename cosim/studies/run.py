@@ -30,7 +30,7 @@ from cosim.core.training_options import CHECKPOINT, LOG, PARAMETERS, TrainingOpt
 from cosim.evaluation import EVALUATION, ITEM_SAMPLES, TIMING, Progress
 from cosim.identity import changed, file_hash
 from cosim.measurement import Factory, Measured, MeasureItem, Noise
-from cosim.plant.fmi import SHIPPED_FMUS
+from cosim.plant.fmi import steps_are_fast
 from cosim.workers import Conditions, Failure, Item, SamplesDone, done
 
 if TYPE_CHECKING:
@@ -357,7 +357,7 @@ def _train_in_episodes(run: TrainingRun, folder: Path, progress: SamplesDone) ->
         progress(samples)
 
     # The plant of a file may be replaced while this process lives.
-    known = _known_costs if run.scenario.plant.fmu in SHIPPED_FMUS else None
+    known = _known_costs if steps_are_fast(run.scenario.plant.fmu) else None
     result = run_training(run, folder, resume=has_checkpoint, progress=show, known=known)
     last_row = result.rows[-1]
     return Trained(

@@ -31,7 +31,7 @@ from controllers.errors import OptimumError, QpError
 from controllers.functions import COMPILED, INTERPRETED, LONG, worth_compiling
 from controllers.model import Model
 from controllers.policy_table import CompiledTable, PolicyTable
-from controllers.problem import VECTORS, PlantProblem, load_model
+from controllers.problem import VECTORS, PlantProblem, Problem, load_model
 from cosim.core.files import cache_folder, read_arrays, write_atomically
 from cosim.core.protocols import CompiledLoop, Decision, Vector
 from cosim.core.scenario import ChangeTable, Scenario
@@ -285,6 +285,32 @@ def _optimum_of(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> Optim
 # the optimal policy ---------------------------------------------------------------------------
 
 
+def look_up(
+    table: PolicyTable,
+    problem: Problem,
+    s: ArrayLike,
+) -> tuple[list[float], list[float], str]:
+    """A state as numbers, what a table has there, and the status of that answer.
+
+    Args:
+        table: of actions and values.
+        problem: has the number of states.
+        s: State in the model's units, (n,).
+
+    Raises:
+        QpError: s is not finite.
+    """
+    state: list[float] = np.asarray(s, dtype=np.float64).tolist()
+    n = problem.n_states
+    # A finite sum has finite terms: one test in place of n.
+    is_usable = len(state) == n and isfinite(sum(state))
+    if not is_usable:
+        raise QpError(f"state {state} is not {n} finite numbers", status="bad state")
+    # The grid ends where no sample of the closed loop was: say so, and go on.
+    row, clamped = table.look_up(state)
+    return state, row, "clamped" if clamped else "solved"
+
+
 class OptimalPolicy:
     """π* and V* = penalty + W of a problem under a disturbance law, from a solved grid.
 
@@ -385,16 +411,7 @@ class OptimalPolicy:
         Raises:
             QpError: s or a is not finite.
         """
-        array = np.asarray(s, dtype=np.float64)
-        state: list[float] = array.tolist()
-        n = self.problem.n_states
-        # A finite sum has finite terms: one test in place of n.
-        is_usable = len(state) == n and isfinite(sum(state))
-        if not is_usable:
-            raise QpError(f"state {state} is not {n} finite numbers", status="bad state")
-        # The grid ends where no sample of the closed loop was: say so, and go on.
-        row, clamped = self._table.look_up(state)
-        status = "clamped" if clamped else "solved"
+        state, row, status = look_up(self._table, self.problem, s)
         if a is None:
             W = row.pop()
             action = np.array(row)

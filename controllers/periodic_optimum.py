@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from math import isfinite
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -23,10 +22,11 @@ from controllers.dynamic_programming.periodic import (
     StepProgress,
     solve_periodic,
 )
-from controllers.errors import ModelError, OptimumError, QpError
+from controllers.errors import ModelError, OptimumError
 from controllers.model import Model
 from controllers.optimum import (
     change_of,
+    look_up,
     optimum_key,
     read_solution,
     solution_document,
@@ -324,13 +324,8 @@ class PeriodicPolicy:
         """
         if a is not None:
             raise OptimumError("the optimal policy of a period has no value of another action")
-        state: list[float] = np.asarray(s, dtype=np.float64).tolist()
-        n = self._problem.n_states
-        if len(state) != n or not isfinite(sum(state)):
-            raise QpError(f"state {state} is not {n} finite numbers", status="bad state")
-        row, clamped = self._table_of_phase().look_up(state)
+        state, row, status = look_up(self._table_of_phase(), self._problem, s)
         W = row.pop()
-        status = "clamped" if clamped else "solved"
         value = W + self._problem.penalty(state)
         return Decision(np.array(row), value, status, 0.0)
 

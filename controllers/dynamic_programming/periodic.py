@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator, Elementwise
+from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
 from controllers.dynamic_programming.grid import Grid
 from controllers.dynamic_programming.solution import (
     GainEstimate,
     Optimum,
     Settings,
     draft_solution,
+    mean_cost_of_paths,
     refined,
 )
 from controllers.errors import OptimumError
-from controllers.model import economic_cost
 from controllers.problem import PlantProblem
 from cosim.core.protocols import Array
 
@@ -57,8 +57,6 @@ MOST_BOXES = 8
 """Boxes that are tried before a policy that still lies on their edge is refused."""
 MOST_PERIODS = 20
 """Periods of value iteration on one box."""
-BURN_IN = 300
-"""Samples of a simulated path before it counts."""
 
 StepProgress = Callable[[str], None]
 """Called with what has been done, in words."""
@@ -573,23 +571,19 @@ def simulate_periodic(
         The mean, and half its 95 % interval.
     """
     plant = periodic.plant
-    problem = plant.problem
-    rng = np.random.default_rng(0)
-    step = Elementwise(plant.sampled(optimum.accuracy.substeps))
-    stage_cost = Elementwise(economic_cost(problem.model))
     linear = Grid(optimum.grid.axes)
-    x: list[Any] = [np.full(paths, value) for value in problem.reference_state]
-    total = np.zeros(paths)
-    n_samples = periods * periodic.period
-    for k in range(-BURN_IN, n_samples):
-        phase = k % periodic.period
-        parameters = periodic.parameters[phase]
-        u = list(_interpolated(linear, optimum.actions[phase], x).T)
-        d = list(plant.law.draw(rng, paths).T)
-        if k >= 0:
-            (cost,) = stage_cost(x, u, d, parameters)
-            total += cost + problem.penalty.along(np.stack(x, axis=1))
-        x = [np.broadcast_to(state, paths) for state in step(x, u, d, parameters)]
-    means = total / n_samples
-    half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
-    return float(means.mean()), float(half_width)
+
+    def actions(number: int, x: list[Any]) -> list[Any]:
+        """Those of the phase, interpolated."""
+        of_phase = optimum.actions[number % periodic.period]
+        return list(_interpolated(linear, of_phase, x).T)
+
+    return mean_cost_of_paths(
+        plant,
+        optimum.accuracy.substeps,
+        np.tile(plant.problem.reference_state, (paths, 1)),
+        actions,
+        lambda number: periodic.parameters[number % periodic.period],
+        periods * periodic.period,
+        np.random.default_rng(0),
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -409,6 +409,8 @@ CERTIFICATE_TOLERANCE = 5e-4
 """Relative distance within which the estimates of a certificate must agree."""
 REQUIRED_ESTIMATES = ("solution", "refinement", "simulation")
 SEARCH = "policy search"
+BURN_IN = 300
+"""Samples of a simulated path before it counts."""
 
 
 def objection(certificate: Sequence[GainEstimate]) -> str | None:
@@ -593,13 +595,7 @@ def simulate_policy(
     Returns:
         The mean, and half its 95 % interval.
     """
-    burn_in = 300
     rng = np.random.default_rng(0)
-    problem = plant.problem
-    model = problem.model
-    parameters = plant.parameters
-    step = Elementwise(plant.sampled(optimum.accuracy.substeps))
-    stage_cost = Elementwise(economic_cost(model))
     # Without the smooth parts: linear, as the policy is applied.
     grid = Grid(optimum.grid.axes)
     policy = [grid.interpolant(column) for column in optimum.actions.T]
@@ -607,26 +603,63 @@ def simulate_policy(
     # The burn-in then only has to forget the grid.
     probabilities = optimum.distribution / optimum.distribution.sum()
     start = rng.choice(grid.size, paths, p=probabilities)
-    # An array (paths,) for each state, action and disturbance.
-    x = list(grid.points[start].T)
+    return mean_cost_of_paths(
+        plant,
+        optimum.accuracy.substeps,
+        grid.points[start],
+        lambda number, x: [action(x) for action in policy],
+        lambda number: plant.parameters,
+        steps,
+        rng,
+    )
+
+
+def mean_cost_of_paths(
+    plant: PlantProblem,
+    substeps: int,
+    start: Array,
+    actions: Callable[[int, list[Any]], list[Any]],
+    parameters: Callable[[int], Array],
+    steps: int,
+    rng: np.random.Generator,
+) -> tuple[float, float]:
+    """Mean cost per sample of independent paths on a plant's model.
+
+    The first `BURN_IN` samples of each path, with numbers below zero, are left out.
+
+    Args:
+        plant: its model and the law of its disturbances.
+        substeps: of the integrator.
+        start: state of each path, (P, n).
+        actions: of a sample's number and the states, n arrays (P,); gives m arrays (P,).
+        parameters: of the plant at a sample's number, (n_p,).
+        steps: samples of each path that count.
+        rng: draws the disturbances.
+
+    Returns:
+        The mean, and half its 95 % interval.
+    """
+    problem = plant.problem
+    paths = len(start)
+    step = Elementwise(plant.sampled(substeps))
+    stage_cost = Elementwise(economic_cost(problem.model))
+    # An array (P,) for each state, action and disturbance.
+    x: list[Any] = list(start.T)
     total = np.zeros(paths)
-    for k in range(burn_in + steps):
-        u = [action(x) for action in policy]
-        disturbances = plant.law.draw(rng, paths)
-        d = list(disturbances.T)
-        if k >= burn_in:
-            (cost,) = stage_cost(x, u, d, parameters)
-            states = np.stack(x, axis=1)
+    for number in range(-BURN_IN, steps):
+        u = actions(number, x)
+        p = parameters(number)
+        d = list(plant.law.draw(rng, paths).T)
+        if number >= 0:
+            (cost,) = stage_cost(x, u, d, p)
             total += cost
-            total += problem.penalty.along(states)
-        x_next = step(x, u, d, parameters)
+            total += problem.penalty.along(np.stack(x, axis=1))
         # A state that depends on no other may be one number.
-        x = [np.broadcast_to(state, paths) for state in x_next]
+        x = [np.broadcast_to(state, paths) for state in step(x, u, d, p)]
 
     # Paths are independent, the samples of one are not: the interval is that of the paths' means.
     means = total / steps
-    deviation = means.std(ddof=1)
-    half_width = 1.96 * deviation / np.sqrt(paths)
+    half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
     return float(means.mean()), float(half_width)
 
 

@@ -15,7 +15,7 @@ STEPS = {
     "export": 2000,
     "evaluation": 2000,
     "scaling": 20,
-    "before": 500,
+    "before": 2000,
     "acados": 200,
     "rollouts": 100_000,
     "batches": 1000,

@@ -7,6 +7,7 @@ machine, and what a command takes beside them is small.
 
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -50,10 +51,10 @@ def build(folder, seconds=SECONDS):
     assert text.count(STEP) == 1
     pause = PAUSE.replace("NANOSECONDS", f"{1e9 * seconds:.0f}").replace("COUNTED", COUNTED)
     face.write_text(pause + text.replace(STEP, f"    take_time();\n{STEP}"), "utf-8")
-    script = compile((folder / f"build_{NAME}.py").read_text("utf-8"), "build", "exec")
     with in_folder(folder), mock.patch.object(fmu_build, "SOURCES", sources):
-        exec(script, {})
-    command("scenario", "init", f"{NAME}.fmu", "--out", f"{NAME}-drafted.toml", folder=folder)
+        runpy.run_path(f"{NAME}.py", run_name="__main__")
+    scenario = ["--model", f"{NAME}:model", "--out", f"{NAME}.toml"]
+    command("scenario", "init", f"{NAME}.fmu", *scenario, folder=folder)
     return folder / f"{NAME}.toml"
 
 

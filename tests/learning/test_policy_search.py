@@ -25,14 +25,24 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_final_theta_is_the_mean_and_improves():
+def test_the_final_theta_is_the_mean():
     every = {"log_every": 780, "evaluate_every": 2340, "checkpoint_every": 2340}
-    run = short_run({"episode": 60}, samples=2340, start="naive", **every)
-    result = run_training(run)
+    result = run_training(short_run({"episode": 60}, samples=2340, start="naive", **every))
     assert result.rows[1]["updates"] == 13
-    costs = [row["J"] for row in result.rows[1:]]
-    assert costs[2] < costs[0]
     assert result.evaluation["J"] == result.rows[-1]["greedy_J"]
+
+
+@pytest.mark.slow
+def test_what_operation_costs_comes_down_in_the_mean_of_three_seeds():
+    # One run of 13 generations may end above its start, and which one does differs by processor.
+    every = {"log_every": 780, "evaluate_every": 2340, "checkpoint_every": 2340}
+    first, last = 0.0, 0.0
+    for seed in range(3):
+        run = short_run({"episode": 60}, samples=2340, seed=seed, start="naive", **every)
+        costs = [row["J"] for row in run_training(run).rows[1:]]
+        first += costs[0]
+        last += costs[2]
+    assert last < 0.6 * first
 
 
 def test_what_a_stretch_costs_at_first_does_not_count(scenario, problem, tuned_theta, rng):

@@ -19,6 +19,7 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, ExplorationProbability
 from learning.errors import DivergenceError
+from learning.gaussian_penalty import normal_penalties
 from learning.persistence import linear_part
 from learning.prediction_errors import PredictionErrors, SortedErrors, expected_penalties
 from learning.q_learning import ValueConfiguration, prior_deviation, redundancy_of
@@ -158,6 +159,7 @@ class ActorCritic(Algorithm):
         self._batch: dict[str, Any] = {
             "s": np.zeros((size, n)),
             "next_s": np.zeros((size, n)),
+            "next_variances": np.zeros((size, n)),
             "cost": np.zeros(size),
             "a": np.zeros((size, m)),
             "policy": np.zeros((size, m)),
@@ -177,6 +179,8 @@ class ActorCritic(Algorithm):
         row = self._filled
         batch["s"][row] = transition.s
         batch["next_s"][row] = transition.next_s
+        if transition.next_variances is not None:
+            batch["next_variances"][row] = transition.next_variances
         batch["cost"][row] = transition.stage_cost
         batch["a"][row] = transition.a
         batch["policy"][row] = transition.solution.action
@@ -224,7 +228,7 @@ class ActorCritic(Algorithm):
         # that lasts shifts realised costs and states together, which a fit would take for a slope
         # of the value in the state: the longer it lasts, the more the model's cost stands in.
         errors = self._errors.values
-        penalty = ExpectedPenalty(self.scenario.state_penalty, errors)
+        penalty = ExpectedPenalty(self.scenario.state_penalty, errors, self._errors.variances)
         independent_share = 1.0 / self._redundancy
         cost = at_policy.cost + independent_share * cost_surprise
         reward = cost + penalty.value(following)
@@ -308,8 +312,11 @@ class ActorCritic(Algorithm):
             systematic = linear_part(states, errors)
             following = following + systematic
             errors = errors - systematic
-        for error in errors:
-            self._errors.add(error)
+        variances = self._batch["next_variances"]
+        # Where all are zero the states are known, and not estimated.
+        are_estimates = bool(variances.any())
+        for error, of_estimate in zip(errors, variances, strict=True):
+            self._errors.add(error, of_estimate if are_estimates else None)
         return following, errors, self._batch["cost"] - applied.cost
 
     def _begin(self, states: Matrix, errors: Matrix) -> None:
@@ -467,11 +474,19 @@ class ExpectedPenalty:
     Args:
         penalty: its weights and bounds.
         errors: e, (M, n).
+        variances: of estimates, (M, n), whose own normal errors add to e; None: of known states.
     """
 
-    def __init__(self, penalty: Penalty, errors: Matrix) -> None:
+    def __init__(
+        self,
+        penalty: Penalty,
+        errors: Matrix,
+        variances: Matrix | None = None,
+    ) -> None:
         self._penalty = penalty
         self._errors = SortedErrors(errors)
+        self._errors_of_estimates = errors
+        self._variances = variances
         # Errors that are all the same leave a kink: a distance that is tiny beside them.
         largest = np.abs(errors).max(axis=0)
         least = 1e-6 * (1.0 + largest)
@@ -480,8 +495,20 @@ class ExpectedPenalty:
 
     def _by_state(self, predictions: Matrix) -> Matrix:
         """Expected penalty of each state's bounds, (n, K)."""
+        if self._variances is not None:
+            return self._by_estimated_state(predictions, self._variances)
         by_bound = expected_penalties(self._penalty, predictions, self._errors)
         by_state: Matrix = by_bound.sum(axis=1)
+        return by_state
+
+    def _by_estimated_state(self, predictions: Matrix, variances: Matrix) -> Matrix:
+        """The same of estimates with `variances` (M, n), (n, K)."""
+        count, n = predictions.shape
+        by_state = np.empty((n, count))
+        for k, prediction in enumerate(predictions):
+            means = prediction + self._errors_of_estimates
+            of_bounds = normal_penalties(self._penalty, means, variances).mean(axis=1)
+            by_state[:, k] = of_bounds[:n] + of_bounds[n:]
         return by_state
 
     def value(self, predictions: Matrix) -> Vector:

@@ -36,15 +36,18 @@ class Transition(NamedTuple):
         q_solution: for Q(s, a); the same object as `solution` where the sample was greedy (then
             Q = V) or the algorithm does not need it.
         stage_cost: ℓ.
-        cost: ℓ plus the penalty of s, the sample's share of J.
+        cost: ℓ plus the penalty of s, as in Q(s, a).
+        known_cost: what can be known of the sample's share of J: `cost`; under sensors ℓ plus the
+            expected penalty of the state.
         next_s: s₊, (n,).
-        next_penalty: penalty of s₊.
+        next_penalty: penalty of s₊, as in V(s₊).
         next_solution: for V(s₊) and π(s₊).
         point, next_point: linearisation points at s and s₊, None unless the rule `needs_points`.
         y: what the sensors showed at s, (n_y,), NaN where nothing came; None without sensors.
         moved_penalty: penalty of the bounds as they are at s₊; None where no signal moves them.
         signal_cost: what known prices alone change of ℓ + V(s₊) − Q(s, a), at the reference.
         known: what was known of the signals at s, by their names; None without signals.
+        next_variances: of the errors of the estimate s₊, (n,); None where the state is known.
     """
 
     number: int
@@ -55,6 +58,7 @@ class Transition(NamedTuple):
     q_solution: RtiSolution
     stage_cost: float
     cost: float
+    known_cost: float
     next_s: Vector
     next_penalty: float
     next_solution: RtiSolution
@@ -64,6 +68,7 @@ class Transition(NamedTuple):
     moved_penalty: Penalty | None = None
     signal_cost: float = 0.0
     known: Known | None = None
+    next_variances: Vector | None = None
 
 
 class Update(NamedTuple):

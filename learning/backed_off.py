@@ -243,6 +243,7 @@ def _transition(sample: Sample, scenario: Scenario) -> Transition | None:
         q_solution=solution,
         stage_cost=step.stage_cost,
         cost=cost,
+        known_cost=cost,
         next_s=step.s,
         next_penalty=next_penalty,
         next_solution=solution,

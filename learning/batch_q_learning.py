@@ -73,7 +73,7 @@ class BatchQLearning(ValueRule):
         """Learn from one sample; the last of a batch moves θ."""
         prediction = self._model(transition.s, transition.a)
         error = transition.next_s - prediction
-        self._errors.add(error)
+        self._errors.add(error, transition.next_variances)
         expected = self._errors.expected_penalty(prediction)
         self._buffer.add(transition, error, expected - transition.next_penalty)
         if self._buffer.count < self._length:

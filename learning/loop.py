@@ -161,12 +161,21 @@ class TrainingLoop:
     def known_penalty(self) -> float:
         """What a rule may know of the present state's penalty: under sensors its expectation."""
         s = self.known_state
+        variances = self._estimate_variances
+        if variances is None:
+            return self.penalty(s.tolist())
+        return float(normal_penalties(self.penalty, s[None], variances[None]).sum())
+
+    @property
+    def _estimate_variances(self) -> Vector | None:
+        """Of the errors of the present estimate, (n,); None where the state is known."""
         estimator = getattr(self.law, "estimator", None)
         covariance = getattr(estimator, "covariance", None)
         if self._loop.y is None or covariance is None:
-            return self.penalty(s.tolist())
-        variances = covariance.diagonal()
-        return float(normal_penalties(self.penalty, s[None], variances[None]).sum())
+            return None
+        # Rounding may leave less than nothing.
+        variances: Vector = np.maximum(covariance.diagonal(), 0.0)
+        return variances
 
     @property
     def parameters(self) -> Parameters:
@@ -210,7 +219,7 @@ class TrainingLoop:
         if update is not None and update.lost and self._retreat is not None:
             self._go_back(self._retreat.best_theta)
         # J is of the truth; what is compared is what can be known of it.
-        known_cost = cost if transition is None else transition.cost
+        known_cost = cost if transition is None else transition.known_cost
         update = self._compared(known_cost) or update
         if update is None:
             return cost, None
@@ -268,7 +277,10 @@ class TrainingLoop:
         number = self.counts.number
         s = self.known_state
         # Of the present estimate, which the next sample replaces.
-        known_penalty = 0.0 if loop.y is None else self.known_penalty
+        rule_penalty = known_penalty = 0.0
+        if loop.y is not None:
+            rule_penalty = self.penalty(s.tolist())
+            known_penalty = self.known_penalty
         a, explored = self._choose(solution)
         # V and Q are one where a = π(s): a greedy sample costs one QP.
         q_solution = solution
@@ -292,11 +304,13 @@ class TrainingLoop:
         cost = step.stage_cost + step.penalty
         if solution is None or q_solution is None or next_solution is None:
             return None, cost
-        # J is of the truth; a rule is told what can be known of it.
+        # J is of the truth; a rule is told what can be known of it. Q and V take the estimate for
+        # the state: the cost that goes with them does, too.
         next_s = self.known_state
-        known_cost = cost
+        known_cost = rule_cost = cost
         if sample.y is not None:
             known_cost = step.stage_cost + known_penalty
+            rule_cost = step.stage_cost + rule_penalty
         needs_points = self.algorithm.needs_points
         transition = Transition(
             number=number,
@@ -306,9 +320,10 @@ class TrainingLoop:
             solution=solution,
             q_solution=q_solution,
             stage_cost=step.stage_cost,
-            cost=known_cost,
+            cost=rule_cost,
+            known_cost=known_cost,
             next_s=next_s,
-            next_penalty=self.known_penalty,
+            next_penalty=self.penalty(next_s.tolist()),
             next_solution=next_solution,
             point=point if needs_points else None,
             next_point=loop.point if needs_points else None,
@@ -316,6 +331,7 @@ class TrainingLoop:
             moved_penalty=self._moved_penalty(),
             signal_cost=stage_change + next_value_change - value_change,
             known=known,
+            next_variances=self._estimate_variances,
         )
         return transition, cost
 

@@ -175,7 +175,7 @@ class PolicySearch(Algorithm):
 
     def observe(self, transition: Transition) -> Update | None:
         """Count a sample's cost; the last one of a stretch begins the next candidate's."""
-        return self._count(transition.cost)
+        return self._count(transition.known_cost)
 
     def failed(self, cost: float) -> Update | None:
         """Count the cost of a sample at which the controller failed."""

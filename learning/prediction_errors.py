@@ -14,6 +14,7 @@ from controllers.theta import Parameters
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.scenario import Penalty, Scenario
 from learning.checkpoint import State
+from learning.gaussian_penalty import normal_penalties
 
 LONGEST_TIME_CONSTANT = 1000.0
 """Cap of the slowest time constant in samples; that of an integrating state is infinite."""
@@ -246,7 +247,8 @@ class PredictionErrors:
     """The last `capacity` errors e = s₊ − f(s, a), and the mean penalty expected from them.
 
     The realised penalty p(s₊) is a rare spike; its expectation mean_i p(f(s, a) + e_i) is smooth in
-    s and a. It needs plant data alone, and the errors include those of the model.
+    s and a. It needs plant data alone, and the errors include those of the model. Under sensors
+    s₊ is an estimate, whose own error is normal: then mean_i E[p(f(s, a) + e_i + n_i)].
     """
 
     def __init__(self, scenario: Scenario, capacity: int) -> None:
@@ -254,6 +256,7 @@ class PredictionErrors:
         # A row a state: NumPy is three times as fast along the errors as along a few states.
         n_states = scenario.state_lower.size
         self._errors = np.zeros((n_states, capacity))
+        self._variances: Matrix | None = None  # of the estimates s₊, as the errors
         self.count = 0
 
     @property
@@ -261,11 +264,25 @@ class PredictionErrors:
         """The errors kept, (K, n), in no order."""
         return self._errors[:, : self.count].T
 
-    def add(self, error: Vector) -> None:
-        """Keep an error (n,) in place of the oldest one."""
+    @property
+    def variances(self) -> Matrix | None:
+        """Variances of the estimates s₊, (K, n), as `values`; None where states are known."""
+        return None if self._variances is None else self._variances[:, : self.count].T
+
+    def add(self, error: Vector, variances: Vector | None = None) -> None:
+        """Keep an error in place of the oldest one.
+
+        Args:
+            error: e, (n,).
+            variances: of the estimate s₊, (n,); None where the state is known, in all samples.
+        """
         _, capacity = self._errors.shape
         oldest = self.count % capacity
         self._errors[:, oldest] = error
+        if variances is not None:
+            if self._variances is None:
+                self._variances = np.zeros(self._errors.shape)
+            self._variances[:, oldest] = variances
         self.count += 1
 
     def expected_penalty(self, prediction: Vector, moved: Penalty | None = None) -> float:
@@ -279,14 +296,22 @@ class PredictionErrors:
         if not len(values):
             return float("nan")
         penalty = self._penalty if moved is None else moved
-        due = known_penalty(penalty, prediction + values)
+        states = prediction + values
+        if self.variances is None:
+            due = known_penalty(penalty, states)
+        else:
+            due = normal_penalties(penalty, states, self.variances).sum(axis=0)
         return float(due.mean())
 
     def state_dict(self) -> State:
         """The errors, and how many there have been."""
-        return {"errors": self._errors, "count": self.count}
+        state: State = {"errors": self._errors, "count": self.count}
+        if self._variances is not None:
+            state["variances"] = self._variances
+        return state
 
     def load_state_dict(self, state: State) -> None:
         """Restore what `state_dict` returned."""
         self._errors = state["errors"]
+        self._variances = state.get("variances")
         self.count = state["count"]

@@ -391,7 +391,7 @@ class QLearning(ValueRule):
         prediction = self._model(transition.s, transition.a)
         error = transition.next_s - prediction
         # First the error, so that the expectation has at least one.
-        self._errors.add(error)
+        self._errors.add(error, transition.next_variances)
         # The realised penalty of s₊ is replaced by its expectation.
         expected = self._errors.expected_penalty(prediction, transition.moved_penalty)
         next_value = transition.next_solution.value - transition.next_penalty + expected

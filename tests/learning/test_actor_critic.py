@@ -135,7 +135,7 @@ def saturated(problem, scenario, rng, cost=6000.0, explores=True):
         wanted = strategy(solution.action, rng) if explores else solution.action
         a = np.clip(wanted, scenario.action_lower, scenario.action_upper)
         s = scenario.initial_state + rng.normal(size=(2, 2))
-        before = (number, s[0], a, explores, solution, solution, cost, cost)
+        before = (number, s[0], a, explores, solution, solution, cost, cost, cost)
         actor.observe(Transition(*before, s[1], 0.0, solution, None, None))
     return actor
 
@@ -152,7 +152,7 @@ def test_costs_that_are_not_finite_are_a_divergence(problem, scenario, rng):
     solution = Solution(np.array([399.0, 200.0]), actor.controller.theta.size)
     s, a = scenario.initial_state, solution.action
     sample = Transition(
-        400, s, a, False, solution, solution, 0.0, 0.0, s, 0.0, solution, None, None
+        400, s, a, False, solution, solution, 0.0, 0.0, 0.0, s, 0.0, solution, None, None
     )
     with pytest.raises(DivergenceError, match="not finite"):
         actor.observe(sample)

@@ -33,6 +33,22 @@ def test_the_expected_penalty_has_the_mean_of_the_realised_one_and_less_spread(s
     assert realised.std() > exact
 
 
+def test_an_estimate_is_expected_to_cost_what_the_states_cost_that_it_may_be(scenario, rng):
+    errors = PredictionErrors(scenario, 50)
+    jumps = rng.normal(size=(50, 2))
+    variances = rng.uniform(0.5, 2.0, size=(50, 2))
+    for jump, of_estimate in zip(jumps, variances, strict=True):
+        errors.add(jump, of_estimate)
+    prediction = np.array([26.0, 60.0])
+    noise = rng.normal(size=(20_000, 50, 2)) * np.sqrt(variances)
+    states = prediction + jumps + noise
+    by_draws = known_penalty(scenario.state_penalty, states).mean()
+    assert errors.expected_penalty(prediction) == pytest.approx(by_draws, rel=0.01)
+    other = PredictionErrors(scenario, 50)
+    other.load_state_dict(errors.state_dict())
+    assert other.expected_penalty(prediction) == errors.expected_penalty(prediction)
+
+
 def test_the_oldest_errors_are_forgotten(scenario):
     errors = PredictionErrors(scenario, 3)
     assert np.isnan(errors.expected_penalty(np.array([25.0, 50.0])))

@@ -68,7 +68,16 @@ def fit_noise(
     sensitivities = estimator.sensitivities
     assert sensitivities is not None
 
+    # Four deviations of the prior: a filter beyond them overflows. A θ file may be from far away.
+    least = prior_mean - 4.0 * prior_width
+    most = prior_mean + 4.0 * prior_width
+    start = np.clip(estimator.noise, least, most)
+    # The method may end at a point that is worse than its start, where a line search has failed.
+    best: Vector = start
+    least_loss = np.inf
+
     def loss(noise: Vector) -> tuple[float, Vector]:
+        nonlocal best, least_loss
         estimator.noise = noise
         replay(estimator, readings, actions)
         # Less the logarithm of the posterior density: of the prior, and of the likelihood.
@@ -77,14 +86,13 @@ def fit_noise(
         value = of_prior - estimator.log_likelihood
         gradient_of_prior = away / prior_width
         gradient = gradient_of_prior - sensitivities.log_likelihood
+        if value < least_loss:
+            least_loss = value
+            best = noise.copy()
         return value, gradient
 
-    # Four deviations of the prior: a filter beyond them overflows. A θ file may be from far away.
-    least = prior_mean - 4.0 * prior_width
-    most = prior_mean + 4.0 * prior_width
-    start = np.clip(estimator.noise, least, most)
     with np.errstate(over="ignore", invalid="ignore"):  # of a filter that runs away
-        result = minimize(
+        minimize(
             loss,
             start,
             jac=True,
@@ -92,8 +100,9 @@ def fit_noise(
             bounds=Bounds(least, most),
             options={"maxiter": rounds, "maxfun": 2 * rounds},
         )
-    best: Vector = result.x if np.isfinite(result.fun) else start
-    # The last point that the method tried need not be the best one: once more with that.
+        # The present η may be far from what the data say: the prior's mean is tried as well.
+        loss(prior_mean)
+    # The last point that was tried need not be the best one: once more with that.
     estimator.noise = best
     standardised = replay(estimator, readings, actions)
     return best, standardised

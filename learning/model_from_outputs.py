@@ -64,6 +64,7 @@ class ModelFromOutputs(Algorithm):
         true_bounds = {"x_l": problem.state_lower, "x_u": problem.state_upper}
         self._base = start.replace(true_bounds)
         self._distance = problem.state_upper - problem.state_lower
+        self._reserve = self._back_offs(start)
 
         # A ring of (y, a).
         sensors = self.scenario.sensors or ()
@@ -151,12 +152,9 @@ class ModelFromOutputs(Algorithm):
         seed = int(self.rng.integers(2**63))
         self._plant.fit(self._filter, parameters, self._errors, seed)
 
-        # The search begins at the present back-offs; a bound of θ beyond the true one has none.
-        lower = present["x_l"] - self._base["x_l"]
-        upper = self._base["x_u"] - present["x_u"]
-        present_back_offs = np.concatenate([lower, upper])
-        start = np.maximum(present_back_offs, 0.0)
-        search = BackOffsBehindFilter(self._plant, base, self._distance, settings)
+        # The search begins at the present back-offs.
+        start = self._back_offs(present)
+        search = BackOffsBehindFilter(self._plant, base, self._distance, self._reserve, settings)
         # Of few samples no back-off shrinks.
         may_shrink = self._n_rows >= settings.shrink_samples
         least = np.zeros_like(start) if may_shrink else start
@@ -170,6 +168,14 @@ class ModelFromOutputs(Algorithm):
         end = self.controller.theta
         update = update_without_fit(present.blocks, present.theta, end, refused=lost)
         return update._replace(lost=lost)
+
+    def _back_offs(self, theta: Parameters) -> Vector:
+        """Those of the lower, then of the upper bounds, (2n,)."""
+        lower = theta["x_l"] - self._base["x_l"]
+        upper = self._base["x_u"] - theta["x_u"]
+        # A bound of θ beyond the true one has none.
+        back_offs: Vector = np.maximum(np.concatenate([lower, upper]), 0.0)
+        return back_offs
 
     def _keep_errors(self, innovations: Array) -> None:
         """Keep those of the samples since the last update, as this fit has them."""
@@ -214,7 +220,7 @@ class SimulatedCost(NamedTuple):
     """What a rollout behind the filter costs.
 
     Attributes:
-        mean: per sample; infinite where a QP failed.
+        mean: per sample; infinite where a QP failed or the loop ran away.
         penalties: expected one of each bound in it, (2n,).
         deviation: of the predicted states' errors, (n,).
     """
@@ -222,6 +228,15 @@ class SimulatedCost(NamedTuple):
     mean: float
     penalties: Vector
     deviation: Vector
+
+
+def _cost_of_a_failure(n: int) -> SimulatedCost:
+    """The cost of a rollout that was not finished, of a model of n states."""
+    return SimulatedCost(
+        mean=np.inf,
+        penalties=np.full(2 * n, np.inf),
+        deviation=np.zeros(n),
+    )
 
 
 class FittedPlant:
@@ -330,18 +345,14 @@ class FittedPlant:
         variances = np.empty((n_samples, n))
         costs = np.empty(n_samples)
         for k in range(n_samples):
-            law.prepare()
-            # The state of a sample is predicted before its readings are taken up.
-            means[k] = estimator.estimate
-            variances[k] = estimator.covariance.diagonal()
             try:
+                law.prepare()
+                # The state of a sample is predicted before its readings are taken up.
+                means[k] = estimator.estimate
+                variances[k] = estimator.covariance.diagonal()
                 a = law.feedback(y).action
             except QpError:
-                return SimulatedCost(
-                    mean=np.inf,
-                    penalties=np.full(2 * n, np.inf),
-                    deviation=np.zeros(n),
-                )
+                return _cost_of_a_failure(n)
             # The cost as a rule under sensors knows it: at the estimate, without noise.
             step.inputs["s"][:] = estimator.estimate
             step.inputs["u"][:] = a
@@ -365,11 +376,12 @@ class FittedPlant:
         by_bound = penalties.mean(axis=1)
         stage_cost = costs[burn_in:].mean()
         mean = float(stage_cost + by_bound.sum())
-        # Of a loop that ran away: NaN would compare as neither more nor less.
-        if not np.isfinite(mean):
-            mean = np.inf
         mean_variance = variances[burn_in:].mean(axis=0)
-        deviation = np.sqrt(mean_variance)
+        # Of a loop that ran away: NaN would compare as neither more nor less.
+        if not np.isfinite(mean) or not np.isfinite(mean_variance).all():
+            return _cost_of_a_failure(n)
+        # Rounding may leave less than nothing of a state that is known.
+        deviation = np.sqrt(np.maximum(mean_variance, 0.0))
         return SimulatedCost(mean, by_bound, deviation)
 
     def _measured(self, s: Vector) -> list[float]:
@@ -386,6 +398,7 @@ class BackOffsBehindFilter:
         plant: the fitted plant.
         base: θ before its back-offs.
         distance: of the true bounds, (n,).
+        reserve: back-offs of bounds that are not active, (2n,).
         settings: of `model-based`.
     """
 
@@ -394,11 +407,13 @@ class BackOffsBehindFilter:
         plant: FittedPlant,
         base: Parameters,
         distance: Vector,
+        reserve: Vector,
         settings: Any,
     ) -> None:
         self._plant = plant
         self._base = base
         self._settings = settings
+        self._reserve = reserve
         self._most = np.tile(settings.largest_back_off * distance, 2)
         self._known: dict[bytes, SimulatedCost] = {}
 
@@ -428,7 +443,8 @@ class BackOffsBehindFilter:
     def best(self, delta: Vector, least: Vector) -> Vector:
         """The cheapest δ that steps along the active bounds lead to.
 
-        A bound is active where its penalty shows. Others keep their back-offs, a reserve.
+        A bound is active where its penalty shows, or where it is backed off further than the
+        reserve: that it costs nothing then may be the back-off's merit. Others keep theirs.
 
         Args:
             delta: present δ, (2n,).
@@ -441,7 +457,7 @@ class BackOffsBehindFilter:
         for steps in (coarse, fine):
             cost = self.cost(delta)
             shows = self._settings.least_penalty_share * abs(cost.mean)
-            active = np.flatnonzero(cost.penalties > shows)
+            active = np.flatnonzero((cost.penalties > shows) | (delta > self._reserve))
             for i in active.tolist():
                 delta = self._along(delta, i, least[i], steps)
         return delta

@@ -5,7 +5,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from controllers import ExtendedKalmanFilter
+from controllers import ExtendedKalmanFilter, RtiNmpc
+from controllers.errors import QpError
+from controllers.factories import tuned
 from controllers.problem import Problem
 from cosim import Scenario
 from cosim.core.scenario import Penalty
@@ -13,8 +15,10 @@ from cosim.core.sensors import Sensors
 from learning import train
 from learning.errors import ConfigurationError
 from learning.gaussian_penalty import expected_penalties_with_errors, normal_penalties
-from learning.innovations import fit_noise
+from learning.innovations import fit_noise, replay
 from learning.log import to_csv
+from learning.model_based import ModelBasedConfiguration
+from learning.model_from_outputs import BackOffsBehindFilter, FittedPlant, SimulatedCost
 from learning.training import run_training
 from learning.training_run import make_run
 from tests.helpers.training import killed_and_resumed
@@ -98,6 +102,48 @@ def test_the_variances_that_made_the_data_are_found():
     assert abs(np.nanstd(innovations) - 1.0) < 0.05
 
 
+@pytest.mark.parametrize("rounds", [1, 2, 15])
+def test_a_fit_never_ends_worse_than_where_it_began_or_than_the_prior(rounds):
+    """A line search may fail where the filter runs away; its last point is no answer."""
+    estimator, readings, actions = linear_readings(np.array([0.6, 2.0]), 60, 4)
+    mean = estimator.noise
+
+    def loss(noise):
+        estimator.noise = noise
+        replay(estimator, readings, actions)
+        away = (noise - mean) / 1.0
+        return float(away @ away) / 2 - estimator.log_likelihood
+
+    # From variances that are far too small each reading is a surprise, and the slope is steep.
+    start = mean - 3.9
+    before = min(loss(start), loss(mean))
+    estimator.noise = start
+    noise, _ = fit_noise(estimator, readings, actions, mean, 1.0, rounds)
+    assert loss(noise) <= before
+
+
+class Bowl:
+    """A stand-in for a fitted plant, whose cost is least at 5; beyond 8 no penalty is left."""
+
+    def run(self, theta, n_samples, burn_in):
+        back_off = theta["x_l"][0] - 25.0
+        penalties = np.array([max(8.0 - back_off, 0.0), 0.0, 0.0, 0.0])
+        return SimulatedCost(100.0 + (back_off - 5.0) ** 2, penalties, np.ones(2))
+
+
+def test_a_back_off_that_went_too_far_comes_down_to_what_is_cheapest():
+    """Its penalty does not show any more, and that it does not is the back-off's merit."""
+    scenario = Scenario.load("assay")
+    settings = ModelBasedConfiguration.from_dict({})
+    reserve = np.array([4.0, 2.0, 18.0, 2.0])
+    base = tuned(scenario).parameters
+    search = BackOffsBehindFilter(Bowl(), base, np.full(2, 50.0), reserve, settings)
+    start = reserve + np.array([26.0, 0.0, 0.0, 0.0])
+    best = search.best(start, np.zeros(4))
+    assert best[0] == pytest.approx(5.0, abs=settings.back_off_step)
+    assert np.array_equal(best[1:], reserve[1:])
+
+
 @pytest.mark.slow
 def test_model_based_fits_the_filter_to_some_hours_of_readings():
     """`assay-fouled`: UA2 is found and the filter's variances move."""
@@ -148,3 +194,20 @@ def test_the_block_is_where_sensors_are():
         blocks[name] = run.starting_parameters().blocks
     assert "noise" not in blocks["paper"]
     assert blocks["assay"].block("noise").labels[-1] == "sensor P2"
+
+
+def test_a_rollout_whose_preparation_fails_costs_infinitely_much(monkeypatch):
+    """Where the filter of a fitted plant runs away there is no QP to solve, and no cost."""
+    scenario = Scenario.load("assay")
+    estimator = ExtendedKalmanFilter.from_scenario(scenario)
+    theta = tuned(scenario).parameters
+    plant = FittedPlant(scenario, theta, n_normal=60.0)
+    plant.fit(estimator, {"UA2": 6.84}, [np.zeros(0), np.zeros(0)], seed=1)
+
+    def fails(controller):
+        raise QpError("the QP is not finite", status="not finite")
+
+    monkeypatch.setattr(RtiNmpc, "prepare", fails)
+    cost = plant.run(theta, 60, 10)
+    assert cost.mean == np.inf
+    assert np.array_equal(cost.deviation, np.zeros(2))

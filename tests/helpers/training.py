@@ -86,6 +86,7 @@ def bare_transition(number: int, s: Array, a: Array, cost: float, next_s: Array)
         q_solution=None,
         stage_cost=cost,
         cost=cost,
+        known_cost=cost,
         next_s=next_s,
         next_penalty=0.0,
         next_solution=None,

@@ -43,11 +43,11 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     # under sensors (`learning.model_from_outputs`)
     noise: bool = Field(True, description="θ has the variances of the estimator, under sensors")
     noise_prior: Positive = Field(
-        2.0,
+        0.5,
         description="standard deviation of the prior of these variances' logarithms",
     )
     output_samples: Count = Field(
-        1440,
+        4320,
         description="latest samples to whose readings filter and model are fitted",
     )
     fit_noise_rounds: Count = Field(15, description="rounds of that fit")

@@ -16,8 +16,7 @@ import numpy as np
 from controllers.errors import ModelError
 from controllers.functions import Definition, StackedFunction, define
 from controllers.model import discretise
-from controllers.problem import Problem
-from controllers.varying import Varying, of_kind
+from controllers.problem import Problem, Varying, of_kind
 from cosim.core.protocols import Vector
 from cosim.core.scenario import SensorTable
 

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ModelError, ModelWarning, warn
-from controllers.problem import Problem
+from controllers.problem import Problem, built_once
 from controllers.qp import Mask
-from controllers.reuse import built_once
 from cosim.core.protocols import Matrix
 
 INTEGRATION_TOLERANCE = 0.01

@@ -35,8 +35,7 @@ from controllers.optimum import (
     write_solution,
 )
 from controllers.policy_table import PolicyTable
-from controllers.problem import PlantProblem
-from controllers.varying import is_price
+from controllers.problem import PlantProblem, is_price
 from cosim.core.files import cache_folder
 from cosim.core.protocols import Array, Decision
 from cosim.core.scenario import Scenario, SignalTable

@@ -21,10 +21,9 @@ from controllers.functions import (
 )
 from controllers.integration import check_integration
 from controllers.model import runge_kutta
-from controllers.problem import Problem
+from controllers.problem import Problem, built_once, of_kind
 from controllers.qp import SoftQp
 from controllers.readout import readout, soft_bounds
-from controllers.reuse import built_once
 from controllers.stage_symbols import (
     given_size,
     moved_references,
@@ -33,7 +32,6 @@ from controllers.stage_symbols import (
     symbolic_stage,
 )
 from controllers.theta import Parameters, Symbols, ThetaBlocks
-from controllers.varying import of_kind
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.validation import instead
 

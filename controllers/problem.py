@@ -1,15 +1,19 @@
-"""The task that a controller is given, in its own units; and the same with the plant's model."""
+"""The task that a controller is given, in its own units; and the same with the plant's model.
+
+What signals say of a problem differs from stage to stage of the horizon (`Varying`). What depends
+on a problem's content alone is built once (`built_once`).
+"""
 
 from __future__ import annotations
 
 import hashlib
 import secrets
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, lru_cache, wraps
 from math import exp, sqrt
 from pathlib import Path
-from typing import Literal
+from typing import Concatenate, Literal, NamedTuple, ParamSpec, TypeVar
 
 import casadi as ca
 import daqp
@@ -22,10 +26,10 @@ from controllers.functions import not_in_c
 from controllers.memory import Memory, remember
 from controllers.model import KINDS, Model, discretise
 from controllers.qp import DAQP_FIXED, DAQP_SETTINGS, DAQP_STATUS, Mask
-from controllers.varying import Varying, varying_quantities
 from cosim.core.modules import exception_line, load_plugin
 from cosim.core.protocols import Matrix, Vector
-from cosim.core.scenario import Penalty, Scenario
+from cosim.core.scenario import Penalty, Scenario, SignalTable
+from cosim.core.validation import instead
 from fmus.states import continuous_states, time_constants
 
 VECTORS = (
@@ -318,6 +322,149 @@ def _frozen(
         raise ModelError(f"problem: {name} must be {size} finite numbers, not {array}")
     array.flags.writeable = False
     return array
+
+
+VaryingKind = Literal["disturbance", "parameter", "price", "lower", "upper", "reference"]
+
+MODEL_KINDS: tuple[VaryingKind, ...] = ("disturbance", "parameter", "price")
+"""Kinds of what a signal gives of the model."""
+
+
+class Varying(NamedTuple):
+    """A quantity that differs from stage to stage.
+
+    Attributes:
+        signal: Name of the signal that gives its values.
+        kind: What it is. A `price` is a parameter that the model's economic cost alone depends on.
+        place: Its number among the model's disturbances, its parameters, the states, or (x, u).
+        nominal: Its value where the signal is not known.
+    """
+
+    signal: str
+    kind: VaryingKind
+    place: int
+    nominal: float
+
+
+def varying_quantities(scenario: Scenario, model: Model) -> tuple[Varying, ...]:
+    """What the signals of a scenario that a controller knows of are to its problem.
+
+    Args:
+        scenario: Has the signals, bounds and reference.
+        model: The controller's model.
+
+    Raises:
+        ModelError: A signal names what the model does not have.
+    """
+    quantities = []
+    for table in scenario.signals or ():
+        # The plant follows such a signal, and the controller hears nothing of it.
+        if table.known == "none":
+            continue
+        if table.model is not None:
+            quantities.append(_of_model(table, table.model, model))
+        elif table.bound is not None:
+            quantities.append(_bound(table, scenario))
+        elif table.reference is not None:
+            quantities.append(_moving_reference(table, table.reference, scenario))
+    return tuple(quantities)
+
+
+def _of_model(
+    table: SignalTable,
+    name: str,
+    model: Model,
+) -> Varying:
+    """The disturbance or parameter of a model that a signal is; raises ModelError."""
+    # No two quantities of a model have one name.
+    disturbances = [quantity.name for quantity in model.disturbances]
+    parameters = [quantity.name for quantity in model.parameters]
+    if name in disturbances:
+        index = disturbances.index(name)
+        nominal = model.disturbances[index].nominal
+        return Varying(table.name, "disturbance", index, nominal)
+    if name in parameters:
+        index = parameters.index(name)
+        kind: VaryingKind = "price" if is_price(model, index) else "parameter"
+        nominal = model.parameters[index].nominal
+        return Varying(table.name, kind, index, nominal)
+    raise ModelError(
+        f"signal '{table.name}': model '{model.name}' has no disturbance or parameter '{name}'"
+        f"{instead(name, (*disturbances, *parameters))}"
+    )
+
+
+def _bound(table: SignalTable, scenario: Scenario) -> Varying:
+    """The bound of a state that a signal is."""
+    index = scenario.plant.states.index(table.bounded_state)
+    kind: VaryingKind
+    if table.is_lower_bound:
+        kind = "lower"
+        bounds = scenario.state_lower
+    else:
+        kind = "upper"
+        bounds = scenario.state_upper
+    nominal = float(bounds[index])
+    return Varying(table.name, kind, index, nominal)
+
+
+def _moving_reference(
+    table: SignalTable,
+    name: str,
+    scenario: Scenario,
+) -> Varying:
+    """The reference of a state or an action that a signal is."""
+    plant = scenario.plant
+    names = [*plant.states, *plant.actions]
+    index = names.index(name)
+    references = np.concatenate([scenario.reference_state, scenario.reference_action])
+    nominal = float(references[index])
+    return Varying(table.name, "reference", index, nominal)
+
+
+def is_price(model: Model, index: int) -> bool:
+    """Whether a parameter is in the economic cost and not in the dynamics."""
+    symbols = model.symbols()
+    *_, p = symbols
+    parameter = p[index]
+    rates = ca.SX(model.ode(*symbols))
+    cost = ca.SX(model.economic_cost(*symbols))
+    in_dynamics = ca.depends_on(rates, parameter)
+    in_cost = ca.depends_on(cost, parameter)
+    return bool(in_cost and not in_dynamics)
+
+
+def given_parameters(varying: Iterable[Varying], model: Model) -> tuple[str, ...]:
+    """Names of a model's parameters whose values signals give, so that θ cannot have them.
+
+    Args:
+        varying: All quantities.
+        model: The controller's model.
+    """
+    items = of_kind(varying, "parameter", "price")
+    return tuple(model.parameters[item.place].name for _, item in items)
+
+
+def of_kind(varying: Iterable[Varying], *kinds: VaryingKind) -> list[tuple[int, Varying]]:
+    """The quantities of some kinds, each with its row among all.
+
+    Args:
+        varying: All quantities.
+        kinds: The kinds that are wanted.
+    """
+    return [(row, item) for row, item in enumerate(varying) if item.kind in kinds]
+
+
+def hold_last(column: Vector, values: Vector) -> None:
+    """Fill the stages of the horizon with what is known of a signal; beyond that it keeps the last.
+
+    Args:
+        column: of the stages 0 … N, (N+1,), which is overwritten.
+        values: the present one and those that follow, as many as are known.
+    """
+    n_known = min(len(values), len(column))
+    column[:n_known] = values[:n_known]
+    column[n_known:] = values[-1]
 
 
 @dataclass(frozen=True)
@@ -845,3 +992,53 @@ def _require_whole_state(scenario: Scenario, filtered: Mapping[str, float]) -> N
             f"{', '.join(hidden)}, too, which plant.states does not name, so there is no J* of "
             "this scenario; compare with the best θ of a search on the plant"
         )
+
+
+P = ParamSpec("P")
+Built = TypeVar("Built")
+
+KEPT = 32
+"""Results that a function keeps: those of the problems that were used last."""
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A call of the function: equal to another one where content and arguments are equal."""
+
+    content: str
+    arguments: tuple[object, ...]
+    options: tuple[tuple[str, object], ...]
+    problem: Problem = field(compare=False)
+
+
+def built_once(
+    build: Callable[Concatenate[Problem, P], Built],
+) -> Callable[Concatenate[Problem, P], Built]:
+    """Keep what a function of a problem builds, for problems of the same `Problem.content`.
+
+    A training, an evaluation and a study make many controllers of one problem, and CasADi's graphs
+    take most of the time to make one. What is kept is shared, so it must never change.
+
+    Args:
+        build: Function of a problem and of other hashable arguments. Its result depends on nothing
+            else.
+    """
+
+    @lru_cache(maxsize=KEPT)
+    def kept(call: _Call) -> Built:
+        options = dict(call.options)
+        return build(call.problem, *call.arguments, **options)  # type: ignore[arg-type]
+
+    @wraps(build)
+    def find(
+        problem: Problem,
+        /,
+        *arguments: P.args,
+        **options: P.kwargs,
+    ) -> Built:
+        # A dictionary has no hash, which the cache looks a call up by.
+        hashable_options = tuple(options.items())
+        call = _Call(problem.content, arguments, hashable_options, problem)
+        return kept(call)
+
+    return find

@@ -21,9 +21,8 @@ from controllers.functions import (
     stage_function,
     sweep_function,
 )
-from controllers.problem import Problem
+from controllers.problem import Problem, built_once
 from controllers.qp import LEAST_SIZE
-from controllers.reuse import built_once
 from controllers.stage_symbols import (
     given_parts,
     given_size,

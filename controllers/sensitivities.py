@@ -25,9 +25,8 @@ from controllers.functions import (
     sweep_function,
 )
 from controllers.preparation import stage_parameter_gradient
-from controllers.problem import Problem, Scale
+from controllers.problem import Problem, Scale, built_once, of_kind
 from controllers.qp import QpSolution, SoftQp, kkt_solve
-from controllers.reuse import built_once
 from controllers.stage_symbols import (
     given_parts,
     given_size,
@@ -35,7 +34,6 @@ from controllers.stage_symbols import (
     stage_columns,
 )
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
-from controllers.varying import of_kind
 from cosim.core.protocols import Matrix, Vector
 
 SOLUTION_PARTS = ("xi", "t", "chi", "v", "lam")

@@ -15,9 +15,8 @@ import numpy as np
 
 from controllers.errors import ModelError
 from controllers.functions import Expression
-from controllers.problem import Problem
+from controllers.problem import Problem, VaryingKind, of_kind
 from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
-from controllers.varying import VaryingKind, of_kind
 from cosim.core.protocols import Vector
 
 

@@ -25,8 +25,7 @@ from pydantic import Field
 
 from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.model import discretise, economic_cost
-from controllers.problem import Problem
-from controllers.varying import MODEL_KINDS, of_kind
+from controllers.problem import MODEL_KINDS, Problem, of_kind
 from cosim.core.protocols import Array
 from cosim.core.scenario import NonNegative, Positive
 from learning.checkpoint import State

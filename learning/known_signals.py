@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controllers.problem import Problem
-from controllers.varying import MODEL_KINDS, hold_last, of_kind
+from controllers.problem import MODEL_KINDS, Problem, hold_last, of_kind
 from cosim.core.protocols import Array
 from cosim.core.scenario import Scenario
 from cosim.core.signals import Known, Signals, period_of

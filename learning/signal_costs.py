@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 
 from controllers.functions import StackedFunction, define
-from controllers.problem import Problem
-from controllers.varying import of_kind
+from controllers.problem import Problem, of_kind
 from cosim.core.protocols import Array
 from cosim.core.signals import Known
 

@@ -15,9 +15,8 @@ import numpy as np
 from controllers.economic import tune
 from controllers.estimator import ExtendedKalmanFilter
 from controllers.factories import nmpc
-from controllers.problem import Problem
+from controllers.problem import Problem, given_parameters
 from controllers.theta import Parameters, ThetaBlocks
-from controllers.varying import given_parameters
 from cosim.core.protocols import Vector
 from cosim.core.scenario import EstimatorTable, Scenario
 from cosim.core.signals import period_of

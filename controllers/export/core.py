@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 from controllers.errors import ControllerError
 from controllers.functions import c_source, not_in_c, work_sizes
 from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions
-from controllers.problem import Problem
+from controllers.problem import Problem, VaryingKind, of_kind
 from controllers.stage_symbols import given_size
 from controllers.theta import Parameters
-from controllers.varying import VaryingKind, of_kind
 from cosim.core.protocols import Vector
 from cosim.core.scenario import Scenario
 

@@ -30,7 +30,7 @@ from controllers.functions import (
     worth_compiling,
 )
 from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions, Spectrum
-from controllers.problem import Problem, linear_model
+from controllers.problem import Problem, hold_last, linear_model
 from controllers.qp import (
     QpBackend,
     QpSolution,
@@ -48,7 +48,6 @@ from controllers.sensitivities import (
 from controllers.stabilised import Stages, solve_stabilised
 from controllers.stage_symbols import nominal_given
 from controllers.theta import Parameters
-from controllers.varying import hold_last
 from cosim.core.protocols import CompiledLoop, Matrix, Vector
 from cosim.core.scenario import Scenario
 

@@ -12,8 +12,7 @@ from controllers import ControllerError, ExtendedKalmanFilter, Model, OutputFeed
 from controllers.errors import ModelError
 from controllers.filter_model import INITIAL_DEVIATION
 from controllers.model import discretise
-from controllers.problem import Problem
-from controllers.varying import Varying
+from controllers.problem import Problem, Varying
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.plugins import build_controller
 from cosim.core.protocols import Decision

@@ -24,14 +24,16 @@ from controllers.model import runge_kutta
 from controllers.problem import Problem, built_once, of_kind
 from controllers.qp import SoftQp
 from controllers.readout import readout, soft_bounds
-from controllers.stage_symbols import (
+from controllers.theta import (
+    Parameters,
+    Symbols,
+    ThetaBlocks,
     given_size,
     moved_references,
     stage_columns,
     symbolic_given,
     symbolic_stage,
 )
-from controllers.theta import Parameters, Symbols, ThetaBlocks
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.validation import instead
 

@@ -23,14 +23,14 @@ from controllers.functions import (
 )
 from controllers.problem import Problem, built_once
 from controllers.qp import LEAST_SIZE
-from controllers.stage_symbols import (
+from controllers.theta import (
+    ThetaBlocks,
     given_parts,
     given_size,
     state_bounds,
     symbolic_given,
     true_bounds,
 )
-from controllers.theta import ThetaBlocks
 from cosim.core.protocols import Vector
 
 

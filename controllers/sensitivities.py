@@ -27,13 +27,15 @@ from controllers.functions import (
 from controllers.preparation import stage_parameter_gradient
 from controllers.problem import Problem, Scale, built_once, of_kind
 from controllers.qp import QpSolution, SoftQp, kkt_solve
-from controllers.stage_symbols import (
+from controllers.theta import (
+    Symbols,
+    ThetaBlocks,
     given_parts,
     given_size,
     moved_references,
     stage_columns,
+    symbolic_theta,
 )
-from controllers.theta import Symbols, ThetaBlocks, symbolic_theta
 from cosim.core.protocols import Matrix, Vector
 
 SOLUTION_PARTS = ("xi", "t", "chi", "v", "lam")

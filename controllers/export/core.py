@@ -17,8 +17,7 @@ from controllers.errors import ControllerError
 from controllers.functions import c_source, not_in_c, work_sizes
 from controllers.preparation import SOLVED_RESIDUAL, Exact, SampleFunctions
 from controllers.problem import Problem, VaryingKind, of_kind
-from controllers.stage_symbols import given_size
-from controllers.theta import Parameters
+from controllers.theta import Parameters, given_size
 from cosim.core.protocols import Vector
 from cosim.core.scenario import Scenario
 

@@ -46,8 +46,7 @@ from controllers.sensitivities import (
     sensitivities,
 )
 from controllers.stabilised import Stages, solve_stabilised
-from controllers.stage_symbols import nominal_given
-from controllers.theta import Parameters
+from controllers.theta import Parameters, nominal_given
 from cosim.core.protocols import CompiledLoop, Matrix, Vector
 from cosim.core.scenario import Scenario
 

@@ -15,7 +15,7 @@ from unittest.mock import patch
 
 from controllers import ExtendedKalmanFilter, Parameters, Problem, RtiNmpc, ThetaBlocks
 from controllers.functions import BUILDS, LONG, build_name
-from controllers.policy_table import table_sources
+from controllers.optimum import table_sources
 from cosim.core.files import replacing
 from cosim.core.scenario import Scenario, presets
 from fmus import PLATFORMS, Platform

@@ -17,8 +17,8 @@ import numpy as np
 from controllers import OptimalPolicy
 from controllers import optimum as store
 from controllers.dynamic_programming import SEARCH, GainEstimate, Settings, objection
+from controllers.factories import build_controller
 from controllers.problem import PlantProblem
-from cosim.core.plugins import build_controller
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import indicators_of
 from cosim.core.statistics import mean

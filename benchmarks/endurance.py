@@ -22,8 +22,8 @@ from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
+from controllers.factories import build_controller
 from cosim import Scenario
-from cosim.core.plugins import build_controller
 from learning.q_learning import QLearning
 from learning.training import run_training
 from learning.training_run import TrainingRun

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from controllers import compile_functions
-from controllers.factories import nmpc, optimal
-from controllers.stored_optimum import stored_optimum
+from controllers.factories import nmpc, optimal, stored_optimum
 from cosim.core.protocols import Controller
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import simulate

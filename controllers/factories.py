@@ -1,19 +1,34 @@
-"""Controllers by name: each function takes a scenario and returns a controller for it.
+"""Controllers by name: registered ones, files of θ, and factories of users.
 
-These are the package's entry points of the group `cosim.controllers`.
+A factory takes a scenario and returns a controller for it; those here are the package's entry
+points of the group `cosim.controllers`.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 from controllers.converged import ConvergedNmpc
-from controllers.errors import ControllerError, ParameterError
-from controllers.problem import Problem
+from controllers.errors import ControllerError, ModelError, OptimumError, ParameterError
+from controllers.problem import PlantProblem, Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.core.scenario import Scenario
+from cosim.core.errors import ControllerLookupError
+from cosim.core.files import read_text
+from cosim.core.modules import (
+    CONTROLLERS,
+    OURS,
+    exception_line,
+    importing,
+    load_plugin,
+    registered,
+)
+from cosim.core.protocols import Controller
+from cosim.core.scenario import Scenario, is_file
+from cosim.core.validation import suggestion
 
 if TYPE_CHECKING:
     from controllers.linear import Lqr, PiLoops
@@ -147,3 +162,131 @@ def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy | PeriodicP
     if change_of(scenario) is None:
         return OptimalPolicy.from_scenario(scenario)
     return QuasiStaticPolicy.from_scenario(scenario)
+
+
+def stored_optimum(scenario: Scenario) -> str | None:
+    """`optimal` where that is the plant's optimum and all of it is shipped or cached, else None.
+
+    A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
+    scenario names the plant's own model.
+    """
+    from controllers.dynamic_programming import Settings  # noqa: PLC0415
+    from controllers.optimum import change_of, optimum_key, stored_file  # noqa: PLC0415
+    from controllers.periodic_optimum import periodic_is_stored  # noqa: PLC0415
+
+    # Nobody knows which plant a foreign FMU is.
+    plant_is_known = scenario.plant.model is not None
+    if is_file(scenario.plant.fmu) and not plant_is_known:
+        return None
+    if scenario.signals:
+        return "optimal" if periodic_is_stored(scenario) else None
+    change = change_of(scenario)
+    # An optimum that is not stored would be solved for minutes: nobody has asked for that.
+    plants = change.plants if change else [scenario]
+    for plant in plants:
+        try:
+            problem = PlantProblem.from_scenario(plant)
+        except (ModelError, OptimumError):
+            return None
+        # No controller is told what this policy needs.
+        if problem.memory is not None:
+            return None
+        key = optimum_key(problem, Settings())
+        if stored_file(key) is None:
+            return None
+    return "optimal"
+
+
+@dataclass(frozen=True)
+class ControllerSource:
+    """A controller by its content, so that it is built alike whatever becomes of its file.
+
+    Attributes:
+        name: an entry point of the group `cosim.controllers`, a `module:factory`, or the path of a
+            θ file.
+        theta: text of the θ file.
+        kind: the NMPC that carries θ, `rti` or `converged`.
+    """
+
+    name: str
+    theta: str | None = None
+    kind: str = "rti"
+
+    @classmethod
+    def read(cls, name: str) -> Self:
+        """Read what `build_controller` takes; raises ControllerLookupError."""
+        if not name.endswith(".toml") or name in registered(CONTROLLERS):
+            return cls(name)
+        return cls(name, read_text(name, f"parameters file '{name}'", ControllerLookupError))
+
+    def build(self, scenario: Scenario) -> Controller:
+        """Build the controller; raises ControllerLookupError and the controller's own errors."""
+        known = registered(CONTROLLERS)
+        name = self.name
+        if self.theta is not None:
+            controller: Controller = from_toml(scenario, self.theta, name, self.kind)
+            name = Path(name).stem
+        elif name in known or ":" in name:
+            controller = _made(name, known.get(name, name), scenario)
+        else:
+            raise ControllerLookupError(
+                f"unknown controller '{name}'{suggestion(name, known)}; give one of "
+                f"{', '.join(sorted(known))}, a parameters file (.toml), or module:factory"
+            )
+        if scenario.sensors:
+            from controllers.estimator import measured  # noqa: PLC0415
+
+            controller = measured(scenario, controller)
+        with suppress(AttributeError):  # as the user calls it, for tables and recordings
+            setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
+        return controller
+
+
+def build_controller(name: str, scenario: Scenario) -> Controller:
+    """Build a controller for a scenario.
+
+    Args:
+        name: an entry point of the group `cosim.controllers`; the path of a TOML file, θ of the
+            RTI-NMPC; or a `module:factory` with factory(scenario) -> Controller.
+        scenario: what it controls.
+
+    Returns:
+        The controller, with the attribute `name` where it can have one.
+
+    Raises:
+        ControllerLookupError: the name leads nowhere, or to no controller.
+    """
+    return ControllerSource.read(name).build(scenario)
+
+
+def _made(
+    name: str,
+    target: str,
+    scenario: Scenario,
+) -> Controller:
+    factory = load_plugin(target, f"controller '{name}'", ControllerLookupError)
+    if not callable(factory):
+        raise ControllerLookupError(f"controller '{name}' is not a factory of one scenario")
+    # A factory may import modules beside its own only now.
+    try:
+        with importing():
+            controller = factory(scenario)
+    except (Exception, SystemExit) as error:
+        packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
+        # The words of our own errors say enough.
+        if target == name and not packages & set(OURS):
+            raise ControllerLookupError(
+                f"the factory of controller '{name}' failed: {exception_line(error)}"
+            ) from error
+        raise
+    if not isinstance(controller, Controller):
+        raise ControllerLookupError(
+            f"controller '{name}' made a {type(controller).__name__}, which lacks reset, prepare "
+            "or feedback"
+        )
+    return controller
+
+
+def parameters_hash(controller: Any) -> str:
+    """The hash of the controller's parameters, empty if it has none."""
+    return str(getattr(getattr(controller, "parameters", None), "hash", "") or "")

@@ -25,6 +25,7 @@ from controllers.dynamic_programming.periodic import (
 from controllers.errors import ModelError, OptimumError
 from controllers.model import Model
 from controllers.optimum import (
+    PolicyTable,
     change_of,
     look_up,
     optimum_key,
@@ -34,7 +35,6 @@ from controllers.optimum import (
     stored_file,
     write_solution,
 )
-from controllers.policy_table import PolicyTable
 from controllers.problem import PlantProblem, is_price
 from cosim.core.files import cache_folder
 from cosim.core.protocols import Array, Decision

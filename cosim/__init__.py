@@ -3,56 +3,44 @@
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import lazy_loader
 
 if TYPE_CHECKING:
-    from cosim.core.plugins import build_controller as build_controller
+    from cosim.control import Parameters as Parameters
+    from cosim.control import build_controller as build_controller
     from cosim.core.protocols import Decision as Decision
     from cosim.core.scenario import Scenario as Scenario
     from cosim.core.simulation import simulate as simulate
     from cosim.core.trajectory import Trajectory as Trajectory
+    from cosim.core.version import __version__ as __version__
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
     from cosim.plant import FmuPlant as FmuPlant
     from cosim.studies.definition import Study as Study
     from cosim.studies.results import StudyResults as StudyResults
     from cosim.studies.results import study as study
-    from cosim.training import Parameters as Parameters
     from cosim.training import Training as Training
     from cosim.training import train as train
 
-    __version__: str
-
 # Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
-_attribute, _names, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "evaluation": ["Evaluation", "evaluate"],
-        "plant": ["FmuPlant"],
-        "core.plugins": ["build_controller"],
+        "control": ["Parameters", "build_controller"],
         "core.protocols": ["Decision"],
         "core.scenario": ["Scenario"],
         "core.simulation": ["simulate"],
+        "core.trajectory": ["Trajectory"],
+        "core.version": ["__version__"],
+        "evaluation": ["Evaluation", "evaluate"],
+        "plant": ["FmuPlant"],
         "studies.definition": ["Study"],
         "studies.results": ["StudyResults", "study"],
-        "training": ["Parameters", "Training", "train"],
-        "core.trajectory": ["Trajectory"],
+        "training": ["Training", "train"],
     },
 )
-
-
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        from importlib.metadata import version  # noqa: PLC0415
-
-        return version("rti-cosim")
-    return _attribute(name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_names(), "__version__"})
 
 
 def _refuse_shadows() -> None:

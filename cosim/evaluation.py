@@ -14,11 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from controllers.stored_optimum import stored_optimum
+from controllers.factories import (
+    ControllerSource,
+    build_controller,
+    parameters_hash,
+    stored_optimum,
+)
 from cosim.core import statistics
 from cosim.core.errors import EvaluationError
 from cosim.core.files import staged
-from cosim.core.plugins import ControllerSource, build_controller, parameters_hash
 from cosim.core.processes import holding
 from cosim.core.protocols import Array, Decision
 from cosim.core.result import Result, text_table
@@ -99,8 +103,8 @@ def evaluate(
     Args:
         scenario: a scenario, a preset's name or a TOML file.
         controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
-            what `cosim.core.plugins.build_controller` takes; or only such texts, or `NAME=…`. The
-            one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
+            what `cosim.build_controller` takes; or only such texts, or `NAME=…`. The one named
+            `naive`, else the first, is the gains' reference; `optimal` gives J*.
         seeds: the seeds, or their number S for 0 … S−1.
         steps: samples per run, from the scenario's initial state on.
         folder: where the tables are written at the end (`Evaluation.write`); None writes none.

@@ -12,8 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from cosim.core.errors import ControllerLookupError
-from cosim.core.modules import OURS, ROOT, TARGET, code_of, forget_users_modules, load_plugin
-from cosim.core.plugins import ALGORITHMS, CONTROLLERS, registered
+from cosim.core.modules import (
+    ALGORITHMS,
+    CONTROLLERS,
+    OURS,
+    ROOT,
+    TARGET,
+    code_of,
+    forget_users_modules,
+    load_plugin,
+    registered,
+)
 from cosim.core.scenario import Scenario
 from cosim.plant.fmi import unpack
 

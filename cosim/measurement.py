@@ -9,7 +9,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from controllers import ConvergedNmpc, RtiNmpc, compile_functions
-from cosim.core.plugins import ControllerSource
+from controllers.factories import ControllerSource
 from cosim.core.protocols import Controller, Vector
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import after, measure, simulate

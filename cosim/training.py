@@ -1,6 +1,5 @@
-"""What `cosim.train` and `cosim.Training` are: handed on from the packages above."""
+"""What `cosim.train` and `cosim.Training` are: handed on from `learning`."""
 
-from controllers.theta import Parameters
 from learning.training import Training, train
 
-__all__ = ["Parameters", "Training", "train"]
+__all__ = ["Training", "train"]

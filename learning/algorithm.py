@@ -10,8 +10,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, get_args
 import numpy as np
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
-from cosim.core.modules import load_plugin
-from cosim.core.plugins import ALGORITHMS, registered
+from cosim.core.modules import ALGORITHMS, load_plugin, registered
 from cosim.core.protocols import Vector
 from cosim.core.scenario import Penalty, Scenario
 from cosim.core.signals import Known

@@ -18,13 +18,11 @@ from threadpoolctl import threadpool_limits
 
 from controllers import compile_functions
 from controllers.estimator import measured
-from controllers.factories import nmpc
+from controllers.factories import build_controller, nmpc, stored_optimum
 from controllers.rti import RtiNmpc
-from controllers.stored_optimum import stored_optimum
 from controllers.theta import Parameters
 from cosim.core.errors import CapabilityError
 from cosim.core.files import check_target, staged, write_atomically
-from cosim.core.plugins import build_controller
 from cosim.core.protocols import Array
 from cosim.core.result import Result
 from cosim.core.scenario import Scenario

@@ -13,11 +13,11 @@ import numpy as np
 
 from controllers import ExtendedKalmanFilter, OutputFeedback, Parameters, Problem, RtiNmpc
 from controllers.export import STATUSES, Observer, core, estimated_state, plain_c
+from controllers.factories import build_controller
 from controllers.filter_model import measured_outputs
 from controllers.theta import ThetaBlocks
 from cosim.core.errors import ControllerLookupError
 from cosim.core.files import write_atomically
-from cosim.core.plugins import build_controller
 from cosim.core.scenario import EstimatorTable, Scenario
 from cosim.core.signals import ahead_of
 from cosim.core.simulation import spawn_seeds

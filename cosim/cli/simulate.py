@@ -102,8 +102,8 @@ def _simulate(
     from importlib.metadata import version
 
     from controllers import compile_functions
+    from controllers.factories import parameters_hash
     from cosim.core.errors import RunEndedError
-    from cosim.core.plugins import parameters_hash
     from cosim.core.simulation import functions_of
 
     recorder = None

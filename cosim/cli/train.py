@@ -65,7 +65,7 @@ def train(
         options: Those of `TrainingOptions`, each an option of the command.
     """
     with cli.output(json) as out_:
-        from controllers.stored_optimum import stored_optimum
+        from controllers.factories import stored_optimum
         from cosim.core.files import staged
         from cosim.core.training_options import CHECKPOINT
         from learning.algorithm import load_algorithm

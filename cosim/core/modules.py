@@ -1,4 +1,4 @@
-"""Modules of users: where they are searched, how they are loaded, which code was loaded."""
+"""Plug-ins: what is registered, where users' modules are searched, which code was loaded."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
-from importlib.metadata import packages_distributions, version
+from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
 from typing import Any
 
+CONTROLLERS = "cosim.controllers"
+"""Group of entry points factory(scenario)."""
+ALGORITHMS = "cosim.algorithms"
+"""Group of entry points of algorithms."""
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 """Form of an object's name, `module:Name`."""
 OURS = ("fmus", "cosim", "controllers", "learning")
@@ -34,6 +38,12 @@ _folders: list[str] = []
 _loaded: dict[Path, str] = {}
 """Hash of the sources at each place from which a user's module was loaded, as of that time."""
 _import_lock = threading.RLock()
+
+
+@cache
+def registered(group: str) -> dict[str, str]:
+    """Targets, `module:Name`, of a group's entry points by name, as this process found them."""
+    return {point.name: point.value for point in entry_points(group=group)}
 
 
 def import_from(folder: str | Path) -> None:

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from controllers.stored_optimum import stored_optimum
+from controllers.factories import stored_optimum
 from cosim.core.errors import StudyError
 from cosim.core.modules import import_from
 from cosim.core.scenario import Scenario, resolved

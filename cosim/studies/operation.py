@@ -13,10 +13,9 @@ from scipy.stats import ttest_1samp
 
 from controllers import compile_functions
 from controllers.estimator import measured
-from controllers.factories import nmpc
+from controllers.factories import build_controller, nmpc
 from controllers.optimum import QuasiStaticPolicy, fouling, frozen
 from cosim.core.errors import StudyError
-from cosim.core.plugins import build_controller
 from cosim.core.protocols import Array, Controller
 from cosim.core.scenario import VIOLATING, Scenario
 from cosim.core.simulation import simulate

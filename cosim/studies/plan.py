@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Self
 
-from cosim.core.plugins import ControllerSource
+from controllers.factories import ControllerSource
 from cosim.core.training_options import LOG, PARAMETERS
 from cosim.evaluation import EVALUATION
 from cosim.identity import code_hash, versions

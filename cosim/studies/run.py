@@ -20,11 +20,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from controllers.factories import ControllerSource
 from controllers.functions import COMPILED, INTERPRETED, LONG, switch
 from cosim.core.errors import StudyError
 from cosim.core.files import read_json, temporary_folder, write_atomically
 from cosim.core.modules import UNKNOWN
-from cosim.core.plugins import ControllerSource
 from cosim.core.scenario import Scenario
 from cosim.core.training_options import CHECKPOINT, LOG, PARAMETERS, TrainingOptions
 from cosim.evaluation import EVALUATION, ITEM_SAMPLES, TIMING, Progress

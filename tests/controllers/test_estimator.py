@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from controllers import ControllerError, ExtendedKalmanFilter, Model, OutputFeedback, Quantity
 from controllers.errors import ModelError
+from controllers.factories import build_controller
 from controllers.filter_model import INITIAL_DEVIATION
 from controllers.model import discretise
 from controllers.problem import Problem, Varying
 from cosim import FmuPlant, Scenario, simulate
-from cosim.core.plugins import build_controller
 from cosim.core.protocols import Decision
 from cosim.core.scenario import SensorTable
 from tests.helpers.compiler import needs_compiler

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from controllers.errors import OptimumError
-from controllers.factories import optimal
+from controllers.factories import optimal, stored_optimum
 from controllers.optimum import QuasiStaticPolicy, change_of, fouling
-from controllers.stored_optimum import stored_optimum
 from cosim import FmuPlant, Scenario
 
 

@@ -7,9 +7,8 @@ import pytest
 
 from controllers import OptimalPolicy
 from controllers.errors import OptimumError
-from controllers.factories import naive
+from controllers.factories import naive, stored_optimum
 from controllers.problem import PlantProblem
-from controllers.stored_optimum import stored_optimum
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.errors import PlantError, ScenarioError
 from cosim.core.scenario import random_coloured_plant, random_plant

@@ -4,9 +4,9 @@ import sys
 
 import pytest
 
+from controllers.factories import build_controller
 from cosim import Scenario
 from cosim.core.errors import ControllerLookupError
-from cosim.core.plugins import build_controller
 from learning.algorithm import load_algorithm
 from learning.errors import AlgorithmLookupError
 from tests.helpers.command import run_cosim

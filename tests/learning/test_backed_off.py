@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from controllers.economic import tune
+from controllers.factories import build_controller
 from controllers.rti import RtiNmpc
-from cosim.core.plugins import build_controller
 from cosim.core.simulation import simulate
 from cosim.core.training_options import TrainingOptions
 from cosim.plant import FmuPlant

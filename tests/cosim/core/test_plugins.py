@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from controllers.factories import build_controller
 from cosim import Scenario
-from cosim.core.plugins import build_controller
 
 ROOT = Path(__file__).parents[3]
 PAPER = Scenario.load("paper")

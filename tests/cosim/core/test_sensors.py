@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from controllers.factories import build_controller
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.errors import CosimError, PlantError, ScenarioError
-from cosim.core.plugins import build_controller
 from cosim.core.scenario import SensorTable
 from cosim.core.sensors import DRAWS_AT_ONCE, Sensors
 

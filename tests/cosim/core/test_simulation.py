@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from controllers import compile_functions
+from controllers.factories import build_controller
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core import simulation
 from cosim.core.errors import PlantError, RunEndedError
-from cosim.core.plugins import build_controller
 from cosim.core.simulation import PART, functions_of, indicators, input_effort, spawn_seeds
 from cosim.core.trajectory import FALLBACK
 from tests.helpers.loop import Failing, Hold, Proportional

@@ -39,7 +39,7 @@ def test_every_case_scenario_and_seed_is_run_and_evaluated(whole):
 
 
 def test_a_run_s_indicators_are_those_of_its_own_closed_loop(whole):
-    from cosim.core.plugins import build_controller
+    from controllers.factories import build_controller
 
     folder = whole / "runs" / "paper" / "grow(rate=2.0)" / "1"
     row = (folder / "evaluation.csv").read_text().splitlines()[2].split(",")

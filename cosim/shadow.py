@@ -17,10 +17,10 @@ import numpy as np
 
 from cosim.core.errors import CosimError
 from cosim.core.logged_data import GAP, LoggedDataError, LogTable, check_sampling_time
-from cosim.core.loop import ClosedLoop, controller_name
 from cosim.core.protocols import Array, Controller, Step
 from cosim.core.result import Result, csv_text
 from cosim.core.scenario import Scenario
+from cosim.core.simulation import ClosedLoop, controller_name
 from cosim.core.trajectory import FALLBACK, RunSignals, Signal
 from fmus.files import write_atomically
 

@@ -18,10 +18,10 @@ from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.core.loop import ClosedLoop, Sample
 from cosim.core.protocols import Array, Step
 from cosim.core.scenario import Scenario
 from cosim.core.sensors import Sensors
+from cosim.core.simulation import ClosedLoop, Sample
 from learning.algorithm import Transition
 from learning.back_off import BackOffConfiguration, BackOffSearch
 from learning.empirical_model import displaced

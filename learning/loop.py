@@ -12,10 +12,10 @@ import numpy as np
 from controllers.estimator import measured
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
-from cosim.core.loop import ClosedLoop
 from cosim.core.protocols import Plant, Step, Vector
 from cosim.core.scenario import Penalty, Scenario
 from cosim.core.signals import Known, signals_of
+from cosim.core.simulation import ClosedLoop
 from cosim.plant import FmuPlant
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
@@ -70,7 +70,8 @@ class Counts:
 class TrainingLoop:
     """Takes samples from a plant and lets a rule move the controller's θ.
 
-    The loop is `cosim.core.loop.ClosedLoop`; this one chooses its actions and counts its failures.
+    The loop is `cosim.core.simulation.ClosedLoop`; this one chooses its actions and counts its
+    failures.
     V(s₊) of a sample is V(s) of the next one, so a greedy sample costs one QP.
 
     Args:

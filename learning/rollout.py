@@ -17,8 +17,8 @@ from controllers.functions import c_source, library, not_in_c, work_sizes
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.core.loop import ClosedLoop
 from cosim.core.protocols import Array, Step
+from cosim.core.simulation import ClosedLoop
 from learning.empirical_model import EmpiricalModel, Features, c_definitions, pointers
 from learning.known_signals import SignalsOfSamples
 

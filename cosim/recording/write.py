@@ -14,9 +14,9 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun import escape_entity_path_part as escaped
 
-from cosim.core.loop import controller_name
 from cosim.core.protocols import Array, Controller
 from cosim.core.scenario import Scenario
+from cosim.core.simulation import controller_name
 from cosim.core.trajectory import SIGNALS, SignalKind
 from cosim.recording.layout import AT, OPENING, axis, properties_table, tabs, view
 from cosim.recording.stream import FREE, SERIES, Channel, Stream, drawable, packed_color, times

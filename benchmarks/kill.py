@@ -27,8 +27,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosim.core.files import read_arrays
-from cosim.core.processes import HOLDER, LOCK, hold, release
+from cosim.core.files import HOLDER, LOCK, hold, read_arrays, release
 from cosim.recording import read_recording
 from tests.helpers.command import alive, eventually, run_cosim, start_cosim
 

@@ -22,8 +22,7 @@ from controllers.factories import (
 )
 from cosim.core import statistics
 from cosim.core.errors import EvaluationError
-from cosim.core.files import staged
-from cosim.core.processes import holding
+from cosim.core.files import holding, staged
 from cosim.core.protocols import Array, Decision
 from cosim.core.result import Result, text_table
 from cosim.core.scenario import Scenario

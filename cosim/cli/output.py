@@ -16,8 +16,8 @@ from typing import Annotated, Any
 import typer
 
 from cosim.core.errors import CosimError
-from cosim.core.files import write_atomically
-from cosim.core.processes import Terminated, hold, redirected_output, release
+from cosim.core.files import hold, release, write_atomically
+from cosim.core.processes import Terminated, redirected_output
 from cosim.core.training_options import MOST
 
 MOST_DRAWN = 20_000

@@ -1,4 +1,4 @@
-"""Files: read with one message per error, cached, temporary; `fmus.files` writes them."""
+"""Files: read with one message per error, cached, temporary, locked; `fmus.files` writes them."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ import json
 import os
 import shutil
 import signal
+import socket
 import stat
+import sys
 import tempfile
 import threading
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import platformdirs
 
+from cosim.core.errors import CosimError
 from fmus.files import check_target, protect, publish, replacing, write_atomically
 
 if TYPE_CHECKING:
@@ -28,12 +32,15 @@ __all__ = [
     "CACHE_VARIABLE",
     "cache_folder",
     "check_target",
+    "hold",
+    "holding",
     "lock",
     "protect",
     "publish",
     "read_arrays",
     "read_json",
     "read_toml",
+    "release",
     "replacing",
     "temporary_folder",
     "write_atomically",
@@ -166,6 +173,71 @@ def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:
             what = f"its file system gives no locks ({error.strerror}): choose another folder"
             error = OSError(error.errno, f"{what}, by {CACHE_VARIABLE} for the cache", str(path))
         raise error from None
+
+
+LOCK = ".cosim.lock"
+HOLDER = ".cosim.lock.holder"
+_locks: dict[Path, filelock.BaseFileLock] = {}
+"""Locks of this process, by folder."""
+
+
+def hold(folder: Path) -> None:
+    """Take a folder's lock until `release`; this process may take it again.
+
+    The system releases the lock when the process ends, however it ends. Raises CosimError that
+    says who holds it and since when, OSError where the folder cannot be written.
+    """
+    import filelock  # noqa: PLC0415
+
+    folder = folder.resolve()
+    if folder in _locks:
+        return
+    try:
+        _locks[folder] = lock(folder / LOCK, 0).lock
+    except filelock.Timeout:
+        who = "another process"
+        with suppress(OSError, ValueError):
+            who = (folder / HOLDER).read_text("utf-8") or who
+        raise CosimError(
+            f"folder '{folder}' is being written by {who}; wait for it or choose another --out"
+        ) from None
+    # What a process that was killed has left.
+    for staged in folder.glob(f"{STAGED}*"):
+        shutil.rmtree(staged, ignore_errors=True)
+    since = datetime.now(UTC).isoformat(timespec="seconds")
+    command = " ".join(["cosim", *sys.argv[1:]])
+    holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
+    write_atomically(folder / HOLDER, holder.encode("utf-8", "backslashreplace"))
+
+
+@contextmanager
+def holding(folder: Path) -> Iterator[None]:
+    """Hold a folder, made if need be, during the block, as `hold` does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ours = folder.resolve() not in _locks
+    hold(folder)
+    try:
+        yield
+    finally:
+        if ours:
+            _release(folder.resolve())
+
+
+def release() -> list[Path]:
+    """Release every lock of this process and remove its files; returns the folders."""
+    folders = list(_locks)
+    for folder in folders:
+        _release(folder)
+    return folders
+
+
+def _release(folder: Path) -> None:
+    lock_ = _locks.pop(folder)
+    # Remove it while it is held: another process then makes another file.
+    for name in (HOLDER, LOCK):
+        with suppress(OSError):
+            (folder / name).unlink()
+    lock_.release()
 
 
 CACHE_VARIABLE = "COSIM_CACHE"

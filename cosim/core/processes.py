@@ -1,28 +1,20 @@
-"""Processes and signals: who ends with whom, and who writes where."""
+"""Processes and signals: who ends with whom, and where a command prints."""
 
 from __future__ import annotations
 
 import atexit
 import os
-import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
-from cosim.core.errors import CosimError
-from cosim.core.files import STAGED, lock, write_atomically
-
-# psutil and filelock are imported where they are needed: every command imports this file.
-if TYPE_CHECKING:
-    import filelock
+# psutil is imported where it is needed: every command imports this file.
 
 
 class Terminated(BaseException):
@@ -217,71 +209,6 @@ def _end(child: subprocess.Popen[bytes]) -> None:
             _, family = psutil.wait_procs(family, 2.0)
     # Reaped here, so that no zombie stays.
     child.wait()
-
-
-LOCK = ".cosim.lock"
-HOLDER = ".cosim.lock.holder"
-_locks: dict[Path, filelock.BaseFileLock] = {}
-"""Locks of this process, by folder."""
-
-
-def hold(folder: Path) -> None:
-    """Take a folder's lock until `release`; this process may take it again.
-
-    The system releases the lock when the process ends, however it ends. Raises CosimError that
-    says who holds it and since when, OSError where the folder cannot be written.
-    """
-    import filelock  # noqa: PLC0415
-
-    folder = folder.resolve()
-    if folder in _locks:
-        return
-    try:
-        _locks[folder] = lock(folder / LOCK, 0).lock
-    except filelock.Timeout:
-        who = "another process"
-        with suppress(OSError, ValueError):
-            who = (folder / HOLDER).read_text("utf-8") or who
-        raise CosimError(
-            f"folder '{folder}' is being written by {who}; wait for it or choose another --out"
-        ) from None
-    # What a process that was killed has left.
-    for staged in folder.glob(f"{STAGED}*"):
-        shutil.rmtree(staged, ignore_errors=True)
-    since = datetime.now(UTC).isoformat(timespec="seconds")
-    command = " ".join(["cosim", *sys.argv[1:]])
-    holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
-    write_atomically(folder / HOLDER, holder.encode("utf-8", "backslashreplace"))
-
-
-@contextmanager
-def holding(folder: Path) -> Iterator[None]:
-    """Hold a folder, made if need be, during the block, as `hold` does."""
-    folder.mkdir(parents=True, exist_ok=True)
-    ours = folder.resolve() not in _locks
-    hold(folder)
-    try:
-        yield
-    finally:
-        if ours:
-            _release(folder.resolve())
-
-
-def release() -> list[Path]:
-    """Release every lock of this process and remove its files; returns the folders."""
-    folders = list(_locks)
-    for folder in folders:
-        _release(folder)
-    return folders
-
-
-def _release(folder: Path) -> None:
-    lock_ = _locks.pop(folder)
-    # Remove it while it is held: another process then makes another file.
-    for name in (HOLDER, LOCK):
-        with suppress(OSError):
-            (folder / name).unlink()
-    lock_.release()
 
 
 @contextmanager

@@ -14,8 +14,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cosim.core.errors import FailedRunsError, StudyError
-from cosim.core.files import staged
-from cosim.core.processes import holding
+from cosim.core.files import holding, staged
 from cosim.core.result import Shown, TextTable, text_table
 from cosim.core.simulation import reporting
 from cosim.core.validation import instead

@@ -14,7 +14,7 @@ from cosim import Scenario, evaluate, study
 from cosim.core.errors import ControllerLookupError, CosimError, FailedRunsError
 from cosim.core.modules import UNKNOWN, import_from, load_plugin
 from cosim.identity import changed, code_hash, depends_on
-from tests.cosim.core.test_processes import HOLD
+from tests.cosim.core.test_files import HOLD
 from tests.helpers.loop import Proportional
 
 ROOT = Path(__file__).parents[2]

@@ -1,14 +1,18 @@
-"""Files are whole or not there; caches are the user's alone; temporary folders end."""
+"""Files are whole or not there, folders have one writer; caches are the user's alone."""
 
 import errno
 import os
+import re
 import signal
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from cosim.core import files
+from cosim.core.errors import CosimError
 from cosim.core.files import (
     cache_folder,
     lock,
@@ -19,7 +23,9 @@ from cosim.core.files import (
     temporary_folder,
     write_atomically,
 )
+from tests.helpers.command import run_cosim
 
+SLOW = pytest.mark.slow
 posix = pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
 
 
@@ -190,3 +196,53 @@ def test_ctrl_c_while_files_are_moved_waits_until_all_are(tmp_path, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         run()
     assert _texts(tmp_path) == {"a.csv": "new", "b.csv": "new"}
+
+
+HOLD = (
+    "import sys, time\n"
+    "from pathlib import Path\n"
+    "from cosim.core.files import hold\n"
+    "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)\n"
+)
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that holds the folder `out`."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, folder], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "-n", "10"],
+        pytest.param(
+            ["evaluate", "--controllers", "naive", "--seeds", "1"], marks=pytest.mark.slow
+        ),
+        pytest.param(["train", "-a", "q-learning", "-n", "10"], marks=SLOW),
+    ],
+)
+def test_a_folder_that_is_being_written_is_refused(holder, tmp_path, command):
+    done = run_cosim(*command, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert re.search(rf"written by process {holder.pid} on \S+ \(.*\) since \S+; ", done.stderr)
+    (tmp_path / "out" / files.HOLDER).unlink()
+    with pytest.raises(CosimError, match="another process"):
+        files.hold(tmp_path / "out")
+
+
+@SLOW
+def test_the_lock_of_a_killed_process_is_given_back(holder, tmp_path):
+    holder.kill()
+    holder.wait()
+    assert run_cosim("simulate", "-n", "10", "--out", tmp_path / "out").returncode == 0
+    left = {path.name for path in (tmp_path / "out").iterdir()}
+    assert not left & {files.LOCK, files.HOLDER}

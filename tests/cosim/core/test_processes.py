@@ -1,15 +1,12 @@
-"""Whatever ends a command ends what it started; one writer per folder."""
+"""Whatever ends a command ends what it started."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
 
 import pytest
 
-from cosim.core import processes
-from cosim.core.errors import CosimError
 from cosim.core.processes import child_process
 from tests.helpers.command import alive, eventually, run_cosim
 
@@ -88,54 +85,6 @@ def test_a_child_has_its_exit_code_and_its_temporary_files_in_its_folder(tmp_pat
     with child_process([sys.executable, "-c", program], folder=tmp_path) as child:
         assert child.wait(60.0) == 3
     assert (tmp_path / "here").read_text() == str(tmp_path)
-
-
-HOLD = (
-    "import sys, time\n"
-    "from pathlib import Path\n"
-    "from cosim.core.processes import hold\n"
-    "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)\n"
-)
-
-
-@pytest.fixture
-def holder(tmp_path):
-    """A process that holds the folder `out`."""
-    folder = tmp_path / "out"
-    folder.mkdir()
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD, folder], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == "held\n"
-        yield process
-        process.kill()
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["simulate", "-n", "10"],
-        pytest.param(["evaluate", "--controllers", "naive", "--seeds", "1"], marks=SLOW),
-        pytest.param(["train", "-a", "q-learning", "-n", "10"], marks=SLOW),
-    ],
-)
-def test_a_folder_that_is_being_written_is_refused(holder, tmp_path, command):
-    done = run_cosim(*command, "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert re.search(rf"written by process {holder.pid} on \S+ \(.*\) since \S+; ", done.stderr)
-    (tmp_path / "out" / processes.HOLDER).unlink()
-    with pytest.raises(CosimError, match="another process"):
-        processes.hold(tmp_path / "out")
-
-
-@SLOW
-def test_the_lock_of_a_killed_process_is_given_back(holder, tmp_path):
-    holder.kill()
-    holder.wait()
-    assert run_cosim("simulate", "-n", "10", "--out", tmp_path / "out").returncode == 0
-    left = {path.name for path in (tmp_path / "out").iterdir()}
-    assert not left & {processes.LOCK, processes.HOLDER}
 
 
 @SLOW

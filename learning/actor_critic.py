@@ -20,8 +20,12 @@ from learning.checkpoint import State, part_of, prefixed
 from learning.configuration import Configuration, Count, ExplorationProbability
 from learning.errors import DivergenceError
 from learning.gaussian_penalty import normal_penalties
-from learning.persistence import linear_part
-from learning.prediction_errors import PredictionErrors, SortedErrors, expected_penalties
+from learning.prediction_errors import (
+    PredictionErrors,
+    SortedErrors,
+    expected_penalties,
+    linear_part,
+)
 from learning.q_learning import ValueConfiguration, prior_deviation, redundancy_of
 from learning.step import ConstrainedStep, Fit, policy_gradient_fit
 

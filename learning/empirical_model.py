@@ -30,7 +30,7 @@ from cosim.core.protocols import Array
 from cosim.core.scenario import NonNegative, Positive
 from learning.checkpoint import State
 from learning.configuration import Configuration, Count, Share
-from learning.persistence import (
+from learning.prediction_errors import (
     effective_number,
     error_covariance,
     estimate_persistence,

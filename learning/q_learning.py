@@ -27,8 +27,13 @@ from learning.configuration import (
     ExplorationShare,
 )
 from learning.errors import DivergenceError
-from learning.persistence import effective_number, estimate_persistence, linear_part
-from learning.prediction_errors import OneStepModel, PredictionErrors
+from learning.prediction_errors import (
+    OneStepModel,
+    PredictionErrors,
+    effective_number,
+    estimate_persistence,
+    linear_part,
+)
 from learning.step import ConstrainedStep, Fit, td_fit, td_step
 
 Values = TypeVar("Values", float, NDArray[np.float64])

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from cosim.core.errors import PlantError, ScenarioError
 from cosim.core.protocols import Array
 from cosim.core.scenario import Scenario
-from cosim.core.signals import ahead_of, signals_of
+from cosim.core.signals import Signals, ahead_of
 from cosim.core.simulation import spawn_seeds
 from cosim.plant import FmuPlant
 
@@ -64,7 +64,7 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         self._plant = FmuPlant(scenario)
         task = self.scenario
         self._most_steps = most_steps
-        self._signals = signals_of(task)
+        self._signals = Signals(task) if task.signals else None
         if self._signals is not None:
             try:
                 # The last observation is made after the last step.

@@ -14,7 +14,7 @@ from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.core.protocols import Plant, Step, Vector
 from cosim.core.scenario import Penalty, Scenario
-from cosim.core.signals import Known, signals_of
+from cosim.core.signals import Known, Signals
 from cosim.core.simulation import ClosedLoop
 from cosim.plant import FmuPlant
 from learning.algorithm import Algorithm, Transition, Update
@@ -105,7 +105,7 @@ class TrainingLoop:
             in_operation = plant
         # What runs in the loop; `controller`, behind the estimator if there is one, carries θ.
         self.law = measured(scenario, controller)
-        self.signals = signals_of(scenario)
+        self.signals = Signals(scenario) if scenario.signals else None
         self._signal_costs = SignalCosts(controller.problem)
         # What known prices change of the present sample's cost, and of V.
         self._signal_changes = (0.0, 0.0)

@@ -344,11 +344,6 @@ def _times(table: SignalTable) -> list[float]:
     return [i * table.length / count for i in range(count)]
 
 
-def signals_of(scenario: Scenario) -> Signals | None:
-    """The signals of a scenario; None without any."""
-    return Signals(scenario) if scenario.signals else None
-
-
 def period_of(scenario: Scenario) -> int | None:
     """Samples after which all valued signals begin again, 1 without any; None where none is."""
     period = 1

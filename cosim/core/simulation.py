@@ -26,7 +26,7 @@ from cosim.core.protocols import (
     Solution,
     Step,
 )
-from cosim.core.signals import Signals, signals_of
+from cosim.core.signals import Signals
 from cosim.core.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
 from cosim.core.validation import whole_number
 
@@ -360,7 +360,8 @@ def simulate(
         ScenarioError: a signal of the scenario, or its preview, ends before the run.
     """
     steps = whole_number("steps", steps, 1, CosimError)
-    signals = signals_of(plant.scenario)
+    scenario = plant.scenario
+    signals = Signals(scenario) if scenario.signals else None
     if signals is not None:
         signals.require(steps)
         plant_seed, _ = spawn_seeds(seed)

@@ -18,7 +18,7 @@ from cosim.core.files import replacing
 from cosim.core.protocols import Array
 from cosim.core.result import Result, csv_text
 from cosim.core.scenario import VIOLATING, Scenario
-from cosim.core.signals import sample_numbers, signals_of
+from cosim.core.signals import Signals, sample_numbers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,7 +75,7 @@ class SignalKind:
 
 def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
     states = columns["states"]
-    signals = signals_of(scenario)
+    signals = Signals(scenario) if scenario.signals else None
     # One penalty for all samples, without a look at each sample's bounds.
     if signals is None or not signals.move_bounds:
         return scenario.state_penalty.along(states)
@@ -85,7 +85,7 @@ def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
 
 def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
     states = columns["states"]
-    signals = signals_of(scenario)
+    signals = Signals(scenario) if scenario.signals else None
     if signals is None or not signals.move_bounds:
         violations = scenario.state_penalty.violation(states)
     else:
@@ -96,12 +96,11 @@ def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
 
 
 def _signals(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
-    signals = signals_of(scenario)
     times = columns["time"]
-    if signals is None:
+    if not scenario.signals:
         return np.empty((len(times), 0))
     samples = sample_numbers(times, scenario)
-    return signals.along(samples)
+    return Signals(scenario).along(samples)
 
 
 # Loop, CSV, recording and comparison follow this table: a derived signal is declared here alone.

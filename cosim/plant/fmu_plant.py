@@ -17,7 +17,7 @@ from cosim.core.errors import CapabilityError, PlantError
 from cosim.core.protocols import Array, CompiledLoop, Step
 from cosim.core.scenario import Scenario
 from cosim.core.sensors import Sensors
-from cosim.core.signals import signals_of
+from cosim.core.signals import Signals
 from cosim.plant.fmi import NOT_FINITE_STATUS, Instance, Intermediate, UnpackedFmu, unpack
 from cosim.plant.probe import Restart, as_asked, probe_of, subject_of
 from cosim.plant.wiring import Wiring, refusals, seed_words
@@ -108,7 +108,7 @@ class FmuPlant:
         self.penalty = scenario.state_penalty
         sensors = scenario.sensors
         self._sensors = Sensors(sensors) if sensors else None
-        self._signals = signals_of(scenario)
+        self._signals = Signals(scenario) if scenario.signals else None
         self.y: Array | None = None
         self._n = len(plant.states)
         self._m = len(plant.actions)

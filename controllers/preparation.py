@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.errors import ControllerError
+from controllers.errors import ControllerError, ModelError, ModelWarning, warn
 from controllers.functions import (
     Definition,
     StackedFunction,
@@ -19,8 +19,7 @@ from controllers.functions import (
     scalar_symbols,
     stage_function,
 )
-from controllers.integration import check_integration
-from controllers.model import runge_kutta
+from controllers.model import Integration, measure_integration, runge_kutta
 from controllers.problem import Problem, built_once, of_kind
 from controllers.qp import SoftQp
 from controllers.readout import readout, soft_bounds
@@ -942,6 +941,47 @@ def _moved_cost(B: ca.SX, b: ca.SX, by: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 HESSIANS = {"gauss-newton": GaussNewton, "exact": Exact}
+
+
+@built_once
+def integration_of(problem: Problem) -> Integration:
+    """How far a sample's prediction is off, at the problem's reference and its bounds."""
+    return measure_integration(
+        problem.model,
+        problem.sampling_time,
+        problem.substeps,
+        problem.reference,
+        problem.lower,
+        problem.upper,
+    )
+
+
+def check_integration(problem: Problem) -> Integration:
+    """Refuse a prediction that is unstable where the model is not; warn where it is coarse.
+
+    Raises ModelError at a mode that decays in the model and grows in the prediction.
+    """
+    model = problem.model
+    integration = integration_of(problem)
+    if integration.unstable:
+        raise ModelError(
+            f"model '{model.name}' is too stiff for substeps = {problem.substeps}: at the "
+            "reference a mode that decays grows in the prediction of a sample of "
+            f"{problem.sampling_time:g} s; {integration.remedy}"
+        )
+    if integration.coarse:
+        where = "at the reference" if integration.at_reference else "at the bounds"
+        # Of a prediction that runs away a number says nothing.
+        size = "many times"
+        if integration.error < 10:
+            size = f"{100 * integration.error:.0f} % of"
+        warn(
+            f"model '{model.name}' is integrated coarsely by substeps = {problem.substeps}: "
+            f"{where} a prediction over {problem.sampling_time:g} s is off by {size} the range of "
+            f"{integration.state}; {integration.remedy}",
+            ModelWarning,
+        )
+    return integration
 
 
 class SampleFunctions:

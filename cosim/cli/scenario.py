@@ -187,11 +187,11 @@ def _parsed_scenario(text: str, target: Path) -> cosim.Scenario:
 
 def _with_enough_substeps(text: str, scenario: cosim.Scenario) -> str:
     """The draft, with more substeps where the model is integrated too coarsely at its bounds."""
-    from controllers.integration import measure_integration
+    from controllers.preparation import integration_of
     from controllers.problem import Problem
 
     problem = Problem.from_scenario(scenario)
-    integration = measure_integration(problem)
+    integration = integration_of(problem)
     substeps = integration.suffices
     # Of a model that no number of steps makes accurate the default stays.
     if not integration.coarse or substeps is None:

@@ -12,7 +12,8 @@ from scipy.linalg import expm
 
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.errors import ModelError, ModelWarning
-from controllers.integration import INTEGRATION_TOLERANCE, measure_integration
+from controllers.model import INTEGRATION_TOLERANCE
+from controllers.preparation import integration_of
 from cosim.core.scenario import Scenario
 from tests.helpers.models import make_model, make_problem
 
@@ -21,7 +22,7 @@ PRESETS = ("paper", "fast-sampling", "slow-sampling", "reactor", "tanks")
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_presets_are_integrated_finely(preset):
-    assert not measure_integration(Problem.from_scenario(Scenario.load(preset))).coarse
+    assert not integration_of(Problem.from_scenario(Scenario.load(preset))).coarse
 
 
 def fast_and_slow(rate, substeps=2):
@@ -52,16 +53,16 @@ def judge_fast_state(rate):
     growth = 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24
     build = lambda: RtiNmpc(problem, Parameters.naive(problem))  # noqa: E731
     if abs(growth) > 1.001:
-        with pytest.raises(ModelError, match=f"substeps = {measure_integration(problem).suffices}"):
+        with pytest.raises(ModelError, match=f"substeps = {integration_of(problem).suffices}"):
             build()
     elif abs(growth**2 - np.exp(-rate)) > 3 * INTEGRATION_TOLERANCE:
         with warnings.catch_warnings(record=True) as shown:
             warnings.simplefilter("always")
             build()
         assert [one.category for one in shown] == [ModelWarning]
-        assert f"substeps = {measure_integration(problem).suffices}" in str(shown[0].message)
-    mended = dataclasses.replace(problem, substeps=measure_integration(problem).suffices)
-    assert not measure_integration(mended).coarse
+        assert f"substeps = {integration_of(problem).suffices}" in str(shown[0].message)
+    mended = dataclasses.replace(problem, substeps=integration_of(problem).suffices)
+    assert not integration_of(mended).coarse
     A = np.array([[-0.3, 1.0], [0.0, -rate]])
     exact = expm(A)
     controller = RtiNmpc(mended, Parameters.naive(mended))
@@ -72,14 +73,14 @@ def judge_fast_state(rate):
 
 def test_an_unstable_plant_is_not_called_stiff():
     model = make_model(lambda x, u, d, p: ca.vertcat(2.0 * x[0] + u, -x[1] + x[0]))
-    integration = measure_integration(make_problem(model))
+    integration = integration_of(make_problem(model))
     assert not integration.unstable and not integration.coarse
 
 
 def test_a_plant_whose_solution_ends_at_a_corner_is_judged_elsewhere():
     model = make_model(lambda x, u, d, p: ca.vertcat(x[0] ** 3 - x[0] + u, -x[1]))
     problem = make_problem(model, width=50.0)
-    assert measure_integration(problem).suffices is not None
+    assert integration_of(problem).suffices is not None
 
 
 def test_a_qp_that_fails_away_from_the_reference_names_the_substeps():
@@ -89,7 +90,7 @@ def test_a_qp_that_fails_away_from_the_reference_names_the_substeps():
     problem = make_problem(model, sampling_time=1.0, width=5.0)
     with pytest.warns(ModelWarning, match="at the bounds"):
         controller = RtiNmpc(problem, Parameters.naive(problem))
-    with pytest.raises(QpError, match=f"substeps = {measure_integration(problem).suffices}"):
+    with pytest.raises(QpError, match=f"substeps = {integration_of(problem).suffices}"):
         for _ in range(5):
             controller.prepare()
             controller.feedback([5.0, 5.0])

@@ -1,13 +1,17 @@
-"""Draw the pictures of README and the pages from the stored studies: `python docs/pictures.py`.
+"""Draw the pictures of README and the pages: `python docs/pictures.py`, a minute.
 
-Each is drawn from the tables in `results/`; none holds a figure of its own.
+`regret.png` is drawn from the tables in `results/`. Those of examples/teaching.md are drawn from a
+training and from runs that this file makes.
 """
 
 from pathlib import Path
 
 import cosim
+from cosim.core.files import temporary_folder
+from cosim.core.training_options import HELD_OUT
 from cosim.figures.bars import Bar, bars_figure
 from cosim.figures.style import REFERENCE, palette, save
+from cosim.figures.trajectory import overlay_figure
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -65,5 +69,21 @@ def draw_regret() -> None:
     save(figure, IMAGES / "regret.png")
 
 
+def draw_teaching() -> None:
+    """A training of Q-learning, and the same disturbances before and after it."""
+    training = cosim.train("q-learning", SCENARIO, 20_000, start="tuned", evaluate_every=2000)
+    training.plot(IMAGES / "learning.png")
+    scenario = cosim.Scenario.load(SCENARIO)
+    runs = {}
+    with cosim.FmuPlant(scenario) as plant, temporary_folder("pictures-") as folder:
+        learned = training.parameters.save(folder / "learned.toml")
+        for name, source in (("naive", "naive"), ("learned", learned), ("optimal", "optimal")):
+            controller = cosim.build_controller(str(source), scenario)
+            # Noise that no training met.
+            runs[name] = cosim.simulate(plant, controller, 500, 2 * HELD_OUT)
+    save(overlay_figure(runs), IMAGES / "before-after.png")
+
+
 if __name__ == "__main__":
     draw_regret()
+    draw_teaching()

@@ -1,4 +1,4 @@
-"""`cosim export`: the learnt controller as an FMU or as C, and the closed loop as an SSP."""
+"""`cosim export`: the learned controller as an FMU or as C, and the closed loop as an SSP."""
 
 from __future__ import annotations
 

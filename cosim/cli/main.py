@@ -148,7 +148,7 @@ for panel, function, example in (
         shadow.shadow,
         "shadow cautious --data cosim-run/trajectory.csv --scenario fouled",
     ),
-    (COMPARE, train.train, "train --algorithm q-learning --samples 20000 --out learnt"),
+    (COMPARE, train.train, "train --algorithm q-learning --samples 20000 --out learned"),
     (LOOK, view.view, "view cosim-run/run.rrd --png run.png"),
     (COMPARE, compare.compare, "compare cosim-run other-run --relative 1e-9"),
     (COMPARE, optimum.optimum, "optimum --scenario paper"),

@@ -67,7 +67,7 @@ _KNOWN = {
     "backoff": "#6699CC",
     "pi": "#B08D57",
     "lqr": "#8C8CD9",
-    "learnt": "#56B4E9",
+    "learned": "#56B4E9",
     "backed-off": "#C9A227",
     "cautious": "#882255",
 }

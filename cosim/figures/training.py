@@ -33,7 +33,7 @@ from cosim.figures.style import (
     symbol,
 )
 
-LEARNED_COLOR = palette(["learnt"])["learnt"].color
+LEARNED_COLOR = palette(["learned"])["learned"].color
 DECADES = 30.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""
 POINTS = 30

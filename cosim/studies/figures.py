@@ -499,14 +499,15 @@ def operation_figure(
             axes.xaxis.set_minor_formatter(NullFormatter())
             style.regret_axis(axes, "y", all_regrets)
             _mark_times(axes, layout.sampling_time, first, last)
-            axes.set_title(title, pad=12)
+            # From the left edge: a narrow panel is narrower than its title.
+            axes.set_title(title, loc="left", pad=12)
             axes.set_xlabel("samples of the plant")
             # Panels beside each other share their ordinate: names stand right of the last one.
             if is_narrow or axes is panels[-1]:
                 ends.append((axes, labels))
         style.ask(
             drawn,
-            "How good is each controller by then, and what has it cost to get there?",
+            "How good is each controller after so many samples, and what have they cost?",
             "Lines: medians over the training seeds; bands: the best to the worst run.",
         )
         style.label_ends(drawn, ends)

@@ -157,7 +157,7 @@ class Comparison:
         return lines
 
     def _lines_of_first(self) -> list[str]:
-        """What differs at the first sample where anything does."""
+        """Signals that differ at the first sample with a difference."""
         sample = self.first
         if sample is None:
             return []

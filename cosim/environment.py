@@ -152,7 +152,7 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         return observation, {}
 
     def _observation(self, s: Array, y: Array | None) -> Array:
-        """What is measured, and what is known of the signals behind it."""
+        """Readings, and behind them the known values of the signals."""
         measured = self._measured(s, y)
         if self._signals is None:
             return measured

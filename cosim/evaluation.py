@@ -295,7 +295,7 @@ def named_controllers(
 
 
 def _name_of_file(path: str) -> str:
-    """What a file of θ is called: by its folder where a training named the file, else its stem."""
+    """Name of a file of θ: its folder where a training named the file, else its stem."""
     file = Path(path)
     folder = file.parent.name
     # All trainings call it the same.

@@ -1,4 +1,4 @@
-"""What a result depends on: versions, our own code, scenario, FMU, plug-ins and data files."""
+"""Identity of a result: versions, our own code, scenario, FMU, plug-ins and data files."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Noise(NamedTuple):
 
 @dataclass
 class Measured:
-    """What was measured.
+    """Results of a measurement.
 
     Attributes:
         indicators, timing: by noise seed.

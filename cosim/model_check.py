@@ -1,4 +1,4 @@
-"""Whether an FMU and a controller's model are the same plant: both at random points."""
+"""Comparison of an FMU with a controller's model at random points."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ModelDifference:
 
 @dataclass(frozen=True)
 class ModelCheck:
-    """What `check_model` found.
+    """Result of `check_model`.
 
     Attributes:
         agrees: Whether every difference is at most `tolerance` of what the quantity varies.

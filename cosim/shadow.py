@@ -140,7 +140,7 @@ class Shadow(Result):
         }
 
     def _run(self, name: str, actions: Array) -> RunSignals:
-        """What was given and these actions, (K, m), as a run of that name."""
+        """Run of the given name: the logged inputs with these actions, (K, m)."""
         signals = {"time": Signal("time", "s", self.time)}
         for i, given in enumerate(self.given_names):
             signals[given] = Signal(given, "", self.given[:, i])

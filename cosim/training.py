@@ -1,4 +1,4 @@
-"""What `cosim.train` and `cosim.Training` are: handed on from `learning`."""
+"""`cosim.train` and `cosim.Training`, imported from the package `learning`."""
 
 from learning.training import Training, train
 

@@ -61,7 +61,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What an item of work was planned with, and what a worker must find.
+    """Conditions of an item of work, which a worker must meet.
 
     Attributes:
         scenario: the whole scenario, with the FMU's absolute path.
@@ -112,7 +112,7 @@ class Conditions:
         return not plugins and not is_file(self.scenario.plant.fmu)
 
     def facts_here(self) -> dict[str, str]:
-        """What this process has in the place of `facts`."""
+        """This process's own values of `facts`."""
         for folder in self.folders:
             import_from(folder)
         return depends_on(self.scenario, *self.parts, files=self.files)
@@ -151,7 +151,7 @@ class Item(Generic[Outcome]):
 
 @dataclass(frozen=True)
 class Report(Generic[Outcome]):
-    """What a worker says of an item.
+    """Report of a worker about an item.
 
     Attributes:
         facts: what it ran with.
@@ -279,7 +279,7 @@ def begin_worker(parent: int) -> None:
 
 
 class _Board:
-    """How far the workers of this machine have come: a number of samples for each item, in a file.
+    """Progress of the workers of this machine: samples of each item, in a file.
 
     Args:
         path: of the file.

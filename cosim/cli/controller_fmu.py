@@ -79,7 +79,7 @@ def rti_controller(
 
 
 def observer_of(controller: RtiNmpc, scenario: Scenario) -> Observer | None:
-    """What makes the state of the readings of the scenario's sensors; None without sensors.
+    """Filter that turns the sensors' readings into a state; None without sensors.
 
     Args:
         controller: whose θ may have the filter's variances.
@@ -217,7 +217,7 @@ def _reading_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
 
 
 def known_counts(scenario: Scenario) -> tuple[int, ...]:
-    """How many values of each known signal a controller is given at a sample."""
+    """Number of values of each known signal that a controller gets at a sample."""
     counts = []
     for signal in scenario.signals or ():
         if signal.known != "none":
@@ -226,7 +226,7 @@ def known_counts(scenario: Scenario) -> tuple[int, ...]:
 
 
 def _known_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
-    """What is known of each signal: its present value or, of a preview, an array of them."""
+    """Known values of each signal: the present one or, of a preview, an array."""
     plant = unpack(scenario.plant.fmu)
     tables = {table.name: table for table in scenario.signals or ()}
     signals = []
@@ -275,7 +275,7 @@ def _estimate_signals(scenario: Scenario, problem: Problem, observer: Observer) 
 
 
 def _manual_signals(scenario: Scenario, problem: Problem) -> list[Variable]:
-    """What takes the controller's place: a switch, and an action of each kind."""
+    """Inputs of manual control: a switch, and an action of each kind."""
     plant = unpack(scenario.plant.fmu)
     # Off where a tool connects nothing to it.
     manual = Variable(

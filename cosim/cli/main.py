@@ -51,7 +51,7 @@ PANELS = {name: panel for panel, names in OPTIONS_OF_PANELS.items() for name in 
 
 
 def _help_text(command: object) -> str:
-    """What a command does: its docstring up to the arguments, a paragraph a line."""
+    """Help text of a command: its docstring up to the arguments, a paragraph a line."""
     text = (getdoc(command) or "").partition("\n\nArgs:\n")[0]
     # A terminal breaks the lines where it ends.
     paragraphs = [paragraph.replace("\n", " ") for paragraph in text.split("\n\n")]

@@ -39,7 +39,7 @@ def count(*names: str, text: str | None = None) -> Any:
 
 
 def descriptions(documented: object, section: str) -> dict[str, str]:
-    """What a docstring says of each name in one of its sections, on one line each.
+    """Descriptions of the names in one section of a docstring, on one line each.
 
     Args:
         documented: what has the docstring.

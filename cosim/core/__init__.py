@@ -1,1 +1,1 @@
-"""What every other package stands on: scenario, signals, protocols, statistics, files, errors."""
+"""Ground of all packages: scenario, signals, protocols, statistics, files, errors."""

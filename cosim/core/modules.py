@@ -208,7 +208,7 @@ def _distributions() -> dict[str, list[str]]:
 
 
 def _place(module: str) -> Path | None:
-    """Where a loaded module's sources are: a folder, or an installed package or file.
+    """Place of a loaded module's sources: a folder, or an installed package or file.
 
     None of a module without a file, and of the script that runs, which was read at its start.
     """

@@ -57,7 +57,7 @@ class Plant(Protocol):
 
 
 class ActionLimits(Protocol):
-    """What a closed loop knows of the actuators; a scenario has it, and a controller's problem."""
+    """Limits of the actuators, as a scenario and a controller's problem have them."""
 
     @property
     def action_lower(self) -> Array:

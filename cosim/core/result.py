@@ -108,7 +108,7 @@ TABLE_FORMATS = {
     "latex": latex_table,
     "html": html_table,
 }
-"""What writes a table of texts in each format."""
+"""Writers of a table of texts, by format."""
 
 
 def text_table(header: Sequence[str], rows: Iterable[Sequence[str]], format: str) -> str:

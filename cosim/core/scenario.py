@@ -256,7 +256,7 @@ class SignalTable(Table):
     reference: Name | None = None
     """The state or action whose reference it is."""
     known: Literal["none", "now", "preview"] = "none"
-    """What a controller knows: nothing, the present value, or the coming ones too."""
+    """Knowledge of the controller: nothing, the present value, or the coming ones too."""
     ahead: Annotated[int, Field(ge=1, le=1000)] | None = None
     """Samples that a preview reaches beyond the present one; without it the horizon."""
 

@@ -102,7 +102,7 @@ class Sensors:
         return np.random.Generator(philox).standard_normal(DRAWS_AT_ONCE)
 
     def state(self) -> tuple[int, Array]:
-        """What `restore` needs to go on from here: the seed, and a copy of the last values."""
+        """State for `restore`: the seed, and a copy of the last values."""
         return self._seed, self._past.copy()
 
     def restore(self, state: tuple[int, Array]) -> None:

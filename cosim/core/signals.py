@@ -189,7 +189,7 @@ class Signals:
         return table
 
     def known(self, k: int) -> Known:
-        """What a controller knows at sample k, by the signals' names.
+        """Known values at sample k, by the signals' names.
 
         Args:
             k: number of the sample.

@@ -166,7 +166,7 @@ class ClosedLoop:
 
     @property
     def given(self) -> Array:
-        """What the controller is given at the present sample: y (n_y,) or the state (n,)."""
+        """Input of the controller at the present sample: y (n_y,) or the state (n,)."""
         if self.y is None or self._given == "truth":
             return self.s
         return self.y

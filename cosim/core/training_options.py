@@ -50,7 +50,7 @@ def _within(least: float, most: float | None, default: float | None) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """What one may choose of a training beside its rule, its scenario and its samples.
+    """Options of a training beside its rule, its scenario and its samples.
 
     Attributes:
         seed: Seed of noise and exploration.

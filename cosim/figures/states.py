@@ -1,4 +1,4 @@
-"""Where the states of runs are: their density at a bound, and phase portraits with the policy."""
+"""States of runs: their density at a bound, and phase portraits with the policy."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def _limits_of_cells(points: Array) -> tuple[float, float]:
 
 
 def _caption(scenario: Scenario, longest: float) -> str:
-    """What arrows, colours and lines mean; `longest` is that of the arrows, in input ranges."""
+    """Legend of arrows, colours and lines; `longest` is the longest arrow, in input ranges."""
     first_action, second_action = scenario.plant.actions[:2]
     right = style.label(first_action, "")
     up = style.label(second_action, "")

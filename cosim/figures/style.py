@@ -496,7 +496,7 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
 
 
 def _height(axes: Axes, y: float) -> float:
-    """Where an ordinate lies on the page, as a share of the axes' height."""
+    """Position of an ordinate on the page, as a share of the axes' height."""
     low, high = axes.get_ylim()
     points = [(0, low), (0, high), (0, y)]
     # By way of the page, since the ordinate may be logarithmic.

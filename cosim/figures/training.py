@@ -104,7 +104,7 @@ def _training_panels(
     theta: Mapping[str, Array],
     baselines: Mapping[str, float],
 ) -> dict[str, Panel]:
-    """What draws each panel of a training, by its title: only of what is known.
+    """Drawing functions of the panels of a training, by title, for the known quantities.
 
     Args:
         log: columns (K,) of the training's log.

@@ -1,4 +1,4 @@
-"""Whether an FMU can be a plant, and how: what it states, and what was seen by trying it."""
+"""Check of an FMU as a plant: its statements, and the results of trials."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NAMES_SHOWN = 5
 
 @dataclass(frozen=True)
 class PlantCheck:
-    """What `check_plant` found.
+    """Result of `check_plant`.
 
     Attributes:
         fmu: the file.

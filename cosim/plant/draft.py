@@ -388,7 +388,7 @@ def _inputs_remark(report: ProbeReport) -> str:
 
 
 def _outputs_remark(report: ProbeReport) -> str:
-    """What is known of the outputs that doStep computes."""
+    """Findings about the outputs that doStep computes."""
     ends = [name for name, kind in report.kinds.items() if kind is OutputKind.END]
     if not ends:
         return "doStep computes the outputs: they are read after it"
@@ -797,7 +797,7 @@ def nearest_steady_state(
     scale: Array = np.maximum(np.abs(start), 1e-2)
 
     def residual(z: Array) -> Array:
-        """How far a sample carries the states, in their scales, (n,)."""
+        """Change of the states in a sample, in their scales, (n,)."""
         x = z[:n]
         u = z[n:]
         plant.reset(0, x)

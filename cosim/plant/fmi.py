@@ -318,7 +318,7 @@ def _describe_leniently(
 
 
 def _obstacle(description: Any) -> str:
-    """What bars any run of a description that failed its validation; empty if nothing does."""
+    """Reasons why a description that failed its validation cannot run; empty if none."""
     interface = description.coSimulation
     if not isinstance(description.guid, str):
         return "it has no guid (FMI 3.0: instantiationToken)"
@@ -440,7 +440,7 @@ def _instead(
     folder: str,
     entry: str,
 ) -> list[str]:
-    """What a platform's folder has in place of the library; nothing where there is no folder."""
+    """Remarks on a platform's folder without its library; empty without a folder."""
     prefix = f"binaries/{folder}/"
     library = entry.removeprefix(prefix)
     inside = sorted(name for name in fmu.entries if name.startswith(prefix))
@@ -468,7 +468,7 @@ _alive: Counter[str] = Counter()
 
 
 class Place(NamedTuple):
-    """Where a number is in an FMU.
+    """Address of a number in an FMU.
 
     Attributes:
         reference: value reference of its variable.
@@ -517,7 +517,7 @@ class Reading(NamedTuple):
 
 
 class Experiment(NamedTuple):
-    """What an FMU is told of the simulation as it starts; None is not told."""
+    """Parameters of the simulation for an FMU's start; None is not passed."""
 
     start_time: float = 0.0
     """Time of the first sample in s."""
@@ -623,7 +623,7 @@ def _why_not_loaded(
     library: str,
     name: str,
 ) -> str:
-    """What keeps a library, which is there, from being loaded; `words` are the system's."""
+    """Reason why an existing library cannot be loaded; `words` are the system's."""
     missing, _, rest = words.partition(": cannot open shared object file: No such file")
     if rest and missing != library:
         return (
@@ -847,7 +847,7 @@ class Instance(ABC):
         return list(values)
 
     def _calls_of_a_step(self, reading: Reading) -> tuple[Callable[[], None], ...]:
-        """What is called before the step, first and second, and after it."""
+        """Calls before the step, first and second, and after it."""
         set_inputs = self._set_inputs
         get_outputs = self._get_outputs
         get_states = self._get_states

@@ -1,4 +1,4 @@
-"""What an FMU can do as a plant, found out by trying it on instances that are thrown away.
+"""Abilities of an FMU as a plant, found by trials on instances that are thrown away.
 
 A model description may be silent or wrong about all of it: whether outputs follow the inputs,
 whether a reset resets, whether a saved state is the whole state. A plant relies on what was seen.
@@ -34,7 +34,7 @@ from cosim.plant.wiring import REALS, Wiring, experiment, has_start, interface
 
 
 class OutputKind(Enum):
-    """Where the numbers of an output belong, and what shows it."""
+    """Kind of an output: the sample to which it belongs, and the evidence."""
 
     FOLLOWS = "follows the actions at once"
     """Get after Set gives g(x_k, u_k): read before the step."""
@@ -53,7 +53,7 @@ AFTER = (OutputKind.SAMPLE, OutputKind.END)
 
 
 class Restart(Enum):
-    """How a second episode begins."""
+    """Start of a second episode."""
 
     RESET = "a reset repeats the first start bit for bit"
     FRESH = "a new instance"
@@ -71,7 +71,7 @@ class Row:
 
 @dataclass(frozen=True)
 class ProbeReport:
-    """What was found out about an FMU as a plant.
+    """Findings about an FMU as a plant.
 
     Attributes:
         fmu, sha256: the file.
@@ -127,7 +127,7 @@ class Subject:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What a finding holds for."""
+        """Subject of a finding."""
         return (
             self.fmu.sha256,
             self.exchanged,
@@ -446,7 +446,7 @@ SHORT_STEP = 2.0**-14
 SAVED_STEPS = 4
 """Steps of a run in which a state is saved after the first one and set again after the last."""
 HARDLY = 0.05
-"""How far an output may move in a short step, as a share of its move in a step."""
+"""Largest move of an output in a short step, as a share of its move in a step."""
 
 
 def as_asked(asked: float, value: float) -> bool:
@@ -504,7 +504,7 @@ def _kind_of(
     acts: bool,
     starts_alike: bool,
 ) -> OutputKind:
-    """Where output i belongs, of one that changes and does not follow a set.
+    """Sample to which output i belongs, if it changes and does not follow a set.
 
     `acts` says that it depends on the action of the same step, `starts_alike` that its value after
     the initialisation repeats.
@@ -524,7 +524,7 @@ def _kind_of(
 
 
 class Findings(NamedTuple):
-    """What `Probe` finds out before a plant runs.
+    """Findings of `Probe` before a plant runs.
 
     Attributes:
         experiment: what the FMU has to be given.
@@ -546,7 +546,7 @@ class Findings(NamedTuple):
 
 
 class Probe:
-    """What is known of a subject; each property tries it once and keeps what it finds.
+    """Findings about a subject; each property is tried once and kept.
 
     Raises PlantError where the FMU cannot be instantiated at all. An FMU that fails while it is
     tried leaves a question open.
@@ -626,7 +626,7 @@ class Probe:
         first: ProbedRun,
         experiment: Experiment,
     ) -> Findings:
-        """What the runs after a first one show; the first failure ends it."""
+        """Findings of the runs after a first one; the first failure ends it."""
         seen = self._nothing_known(experiment)
         looked: Sequence[ProbedStep] | None = None
         # A reset must repeat the first run to the bit, before any other run relies on it.
@@ -715,7 +715,7 @@ class Probe:
         looked: Sequence[ProbedStep],
         starts_alike: bool,
     ) -> tuple[OutputKind, ...]:
-        """Where each output belongs, by runs that differ in one thing.
+        """Sample to which each output belongs, by runs that differ in one thing.
 
         `looked` are the samples of `first` with a look after each set, if that is harmless.
         """

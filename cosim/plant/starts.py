@@ -12,7 +12,7 @@ from cosim.plant.fmi import Order, Reading, UnpackedFmu, number
 from cosim.plant.wiring import REALS, Wiring, has_start
 
 START_WORDS = ("start", "init", "initial", "ini", "initialvalue", "startvalue", "t0", "0")
-"""What tools add to a state's name: `c_start` (Modelica), `T0` (20-sim), `x_initial`, `xInit`."""
+"""Words that tools add to a state's name: `c_start` (Modelica), `T0` (20-sim), `xInit`."""
 PROBED = 1e-3
 """Share of a state's scale by which a probe moves its start."""
 AGREES = 1e-6

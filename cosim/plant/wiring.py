@@ -286,7 +286,7 @@ class Wiring:
         table: str,
         misfit: Callable[[Any], str],
     ) -> Place:
-        """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is.
+        """Address of variable `name`, or of an element ``NAME[i]``, ``NAME[i,j]`` of an array.
 
         `misfit` says what is wrong with a variable, if anything.
         """

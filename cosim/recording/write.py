@@ -298,7 +298,7 @@ class RerunRecorder:
         return tabs(views_of)
 
     def _opening_channels(self) -> list[Channel]:
-        """What the recording opens on: two states and two inputs, or more of the others."""
+        """First view of the recording: two states and two inputs, or more of the others."""
         states = self._group("states")
         actions = self._group("actions")
         n_states = max(2, OPENING - len(actions))

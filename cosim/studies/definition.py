@@ -385,7 +385,7 @@ class Study:
         value: Choice | dict[str, Choice],
         field: str,
     ) -> Choice:
-        """What a field of the study says for a scenario, itself or as the default."""
+        """Value of a field of the study for a scenario, or its default."""
         if not isinstance(value, dict):
             return value
         check_known(value, [*self.scenarios, DEFAULT], field, "scenario")

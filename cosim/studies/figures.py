@@ -607,4 +607,4 @@ STUDY_FIGURES: dict[str, Callable[[StudyMeasurements, str, float], Figure | None
     "regret": draw_regrets,
     "operation": draw_operation,
 }
-"""What draws each kind of figure of a scenario."""
+"""Drawing functions of the kinds of figures of a scenario."""

@@ -1,4 +1,4 @@
-"""What a study keeps of its runs beside the tables, trajectories, logs and θ, and their figures."""
+"""Files that a study keeps beside its tables: trajectories, logs and θ, and their figures."""
 
 from __future__ import annotations
 

@@ -342,7 +342,7 @@ class StudyMeasurements:
         return operation_result(runs_here, greedy_here, optimum)
 
     def operation_layout(self, scenario: str) -> OperationLayout:
-        """What tables and figure of a scenario in operation show."""
+        """Layout of tables and figure of a scenario in operation."""
         about = self.about["operation"][scenario]
         return OperationLayout(
             sampling_time=about["sampling_time"],

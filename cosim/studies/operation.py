@@ -179,7 +179,7 @@ def operation_metrics(
     first_change: int,
     memory: float = 0.0,
 ) -> dict[str, float]:
-    """What the first samples of a run in operation cost.
+    """Costs of the first samples of a run in operation.
 
     Args:
         samples: Number of the run's samples so far.

@@ -32,7 +32,7 @@ EFFORT_COLUMNS = ["first_change", "violating", "dearest", "updates", "model_samp
 
 @dataclass(frozen=True)
 class OperationLayout:
-    """What the tables and the figure of a scenario in operation show.
+    """Layout of tables and figure of a scenario in operation.
 
     Attributes:
         sampling_time: of the plant, in s.
@@ -159,7 +159,7 @@ def _effort_rows(
     seconds: Mapping[str, float],
     samples_per_week: float,
 ) -> list[list[str]]:
-    """What each case's median run took.
+    """Effort of each case's median run.
 
     Args:
         end: rows of the runs at the last mark.

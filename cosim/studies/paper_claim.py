@@ -24,7 +24,7 @@ IMPLIED_RATIO = (1 - PAPER["naive"] / 100) / (1 - PAPER["tuned"] / 100)
 
 
 class Gains(NamedTuple):
-    """What the median run of a trained case gains over both baselines on a scenario.
+    """Gain of the median run of a trained case over both baselines on a scenario.
 
     Attributes:
         scenario, case: names.
@@ -57,7 +57,7 @@ class Gains(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """How far both gains are from the paper's, in per cent."""
+        """Distance of both gains from the paper's, in per cent."""
         from_a = 100 * self.over_a.value - PAPER["naive"]
         from_b = 100 * self.over_b.value - PAPER["tuned"]
         return hypot(from_a, from_b)

@@ -150,7 +150,7 @@ class _CaseOnScenario:
         )
 
     def _facts(self, training: TrainingJob | None) -> dict[str, Any]:
-        """What a run's results depend on beside its conditions."""
+        """Inputs of a run's results beside its conditions."""
         facts: dict[str, Any] = {}
         theta = self.controller.theta
         if theta is not None:
@@ -225,7 +225,7 @@ class _CaseOnScenario:
         return wanted
 
     def _kept(self, seed: int | None) -> dict[str, str]:
-        """Where the study keeps a copy of a run's files, by file."""
+        """Places of the study's copies of a run's files, by file."""
         scenario = folder_name(self.name)
         case = folder_name(self.case.name)
         kept = {}

@@ -91,7 +91,7 @@ def _known_columns(study: StudyMeasurements, scenario: str) -> list[str]:
 
 
 def _printed_intervals(study: StudyMeasurements, summary: Mapping[str, Any]) -> dict[str, float]:
-    """What a printed row shows beside its columns of the summary."""
+    """Intervals of a printed row, beside its columns of the summary."""
     case = summary["case"]
     scenario = summary["scenario"]
     # Of one training the interval is over the noise alone.
@@ -156,7 +156,7 @@ def aggregate_table(study: StudyMeasurements) -> TitledRows:
 
 
 def cases_table(study: StudyMeasurements) -> TitledRows:
-    """What each case is."""
+    """Description of each case."""
     header = ("case", "algorithm or controller", "samples", "start", "NMPC", "settings")
     rows = []
     for case in study.cases.values():

@@ -173,7 +173,7 @@ class TrainingJob:
         return make_run(self.algorithm, scenario, self.samples, self.settings, self.options)
 
     def facts(self, start: str) -> dict[str, Any]:
-        """What the training's result depends on, with the start as the study's file names it."""
+        """Inputs of the training's result, with the start as the study's file names it."""
         return {
             "algorithm": self.algorithm,
             "samples": self.samples,
@@ -226,7 +226,7 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Where its files are, relative to the study's folder."""
+        """Folder of its files, relative to the study's."""
         scenario = folder_name(self.scenario.name)
         folder = Path(RUNS_FOLDER, scenario, folder_name(self.case))
         return folder if self.seed is None else folder / str(self.seed)
@@ -273,7 +273,7 @@ def functions_for(noise: Mapping[str, Noise]) -> str:
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training gives.
+    """Result of a training.
 
     Attributes:
         log: learning.csv as text.
@@ -388,7 +388,7 @@ class RunStore:
     def __init__(self, out: Path, run: Run) -> None:
         self.folder = out / run.folder
         self.remarks: list[str] = []
-        """What was changed or damaged and is done anew, in words."""
+        """Changed or damaged work that is done again, in words."""
         self.run = run
         self.done = 0
         """Plant samples of the run that are done."""
@@ -723,7 +723,7 @@ class Runner:
         for store in self.stores.values():
             remarks.update(dict.fromkeys(store.remarks))
         self.remarks = list(remarks)
-        """What was changed or damaged and is done anew, in words."""
+        """Changed or damaged work that is done again, in words."""
 
     def run(self, jobs: int, scheduler: str | None) -> None:
         """Do all that is not done; failed runs do not stop the others.
@@ -749,7 +749,7 @@ class Runner:
                 store.flush()
 
     def _items(self, shared_disk: bool) -> dict[WorkKey, Item[Any]]:
-        """What can be done now."""
+        """Work that can be done now."""
         items: dict[WorkKey, Item[Any]] = {}
         for name, store in self.stores.items():
             if name in self.failures or store.complete:

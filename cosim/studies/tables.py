@@ -51,7 +51,7 @@ CASE_FIELDS = (
     "start",
     "target",
 )
-"""What study.json says of a case as it is."""
+"""Entry of a case without training in study.json."""
 
 
 def measured_tables(plan: StudyPlan, stores: Iterable[RunStore]) -> dict[str, pd.DataFrame]:
@@ -207,7 +207,7 @@ def document(plan: StudyPlan) -> dict[str, Any]:
 
 
 def _about_case(study: Study, case: Case) -> dict[str, Any]:
-    """What study.json says of a case."""
+    """Entry of a case in study.json."""
     about = {name: getattr(case, name) for name in CASE_FIELDS}
     about["trained"] = case.algorithm is not None
     about["against"] = study.counterpart(case)
@@ -215,7 +215,7 @@ def _about_case(study: Study, case: Case) -> dict[str, Any]:
 
 
 def _about_operation(study: Study) -> dict[str, dict[str, Any]]:
-    """What study.json says of operation, by scenario; {} where no case learns in operation."""
+    """Entry of operation in study.json, by scenario; {} where no case learns in operation."""
     table = study.table.operation
     learns = any(case.algorithm for case in study.cases)
     if table is None or not learns:

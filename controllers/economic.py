@@ -60,7 +60,7 @@ class SteadyState:
     units: tuple[str, ...]
 
     def prices(self) -> tuple[str, ...]:
-        """What each active bound costs: its multiplier, the cost of a sample by a unit of it."""
+        """Price of each active bound: its multiplier, the cost of a sample by a unit of it."""
         sentences = []
         multipliers = np.abs(self.C @ self.multipliers)
         for row, bound, multiplier in zip(self.C, self.active, multipliers, strict=True):
@@ -561,7 +561,7 @@ class Addition:
 
 @dataclass(frozen=True)
 class LocalTuning:
-    """What the tuning makes of a steady state: a convex stage cost, its value and feedback.
+    """Result of the tuning at a steady state: a convex stage cost, its value and feedback.
 
     Attributes:
         convexification: The convex stage cost.

@@ -62,7 +62,7 @@ ESTIMATOR_METHODS = ("predict", "correct", "reset", "state_dict", "load_state_di
 
 
 class Estimator(Protocol):
-    """What estimates the state from the readings.
+    """Estimator of the state from the readings.
 
     A sample is `correct(y)`, after the first one preceded by `predict(a)` with the action that was
     applied.
@@ -479,7 +479,7 @@ class ExtendedKalmanFilter:
         self._covariance -= np.outer(gain, across)
 
     def expected_readings(self, s: ArrayLike, p: ArrayLike) -> Vector:
-        """What the sensors' variables are at a state, (n_y,).
+        """Values of the sensors' variables at a state, (n_y,).
 
         Args:
             s: State, (n,).
@@ -668,7 +668,7 @@ class OutputFeedback:
         self._is_corrected = False
 
     def state_dict(self) -> dict[str, Vector]:
-        """What the estimator remembers, after a `feedback`; the controller keeps its own."""
+        """Memory of the estimator after a `feedback`; the controller keeps its own."""
         return self.estimator.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Vector]) -> None:

@@ -1,4 +1,4 @@
-"""What an extended Kalman filter computes with: the model's step, its outputs, where it starts.
+"""Functions of an extended Kalman filter: the model's step, its outputs, its start.
 
 The filter's state z is the model's, and behind it the parameters that the model calls uncertain. A
 disturbance or parameter that a known signal is has the signal's present value.
@@ -59,7 +59,7 @@ class FilterModel:
 
     @property
     def n_kept(self) -> int:
-        """How many samples of z the filter keeps: the present one, and those of late readings."""
+        """Samples of z that the filter keeps: the present one, and those of late readings."""
         return max(self.delays) + 1
 
     @property
@@ -71,7 +71,7 @@ class FilterModel:
 def filter_model(
     problem: Problem, sensors: Sequence[SensorTable], uncertain: Sequence[int]
 ) -> FilterModel:
-    """What a filter on a problem's model computes with.
+    """Functions of a filter on a problem's model.
 
     Args:
         problem: Has the model with its nominal disturbances and parameters, and the reference.
@@ -199,7 +199,7 @@ def _output(
 def measured_outputs(
     problem: Problem, sensors: Sequence[SensorTable], uncertain: Sequence[int] = ()
 ) -> StackedFunction:
-    """What sensors read of the model: `y` (n_y,) and C = ∂y/∂z, by z.
+    """Readings of the sensors from the model: `y` (n_y,) and C = ∂y/∂z, by z.
 
     Args:
         problem: Has the model.

@@ -36,7 +36,7 @@ MAX_SUBSTEPS = 1000
 MAX_CORNERS = 16
 """Most corners of the bounds that are tried; of more, each bound alone."""
 GROWTH_MARGIN = 1e-6
-"""How far above 1 a mode's growth must be to count as one: rounding is below."""
+"""Least growth of a mode above 1 that counts: rounding is below."""
 
 
 REMEDIES = (
@@ -64,7 +64,7 @@ REMEDIES = (
         "it uses a function of numbers, of math or NumPy, on an expression: use CasADi's",
     ),
 )
-"""What an exception in a model's function means, by a pattern of its text."""
+"""Meanings of exceptions in a model's function, by a pattern of their texts."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def _copy(argument: Any) -> Any:
 
 
 def _column(result: Any) -> Any:
-    """What a function returned as a CasADi column; None where it is not one at all."""
+    """Result of a function as a CasADi column; None where it is none."""
     if isinstance(result, ca.SX | ca.MX | ca.DM):
         return result
     if isinstance(result, np.ndarray):
@@ -216,7 +216,7 @@ def _words(result: Any) -> str:
 
 
 def _meaning(error: Exception) -> str:
-    """What went wrong in a function and how to mend it, where that can be told, in one line."""
+    """Error in a function and its remedy, where one is known, in one line."""
     for pattern, remedy in REMEDIES:
         if re.search(pattern, str(error)):
             return f"{remedy} ({_short(error)})"
@@ -583,7 +583,7 @@ class Integration:
 
     @property
     def remedy(self) -> str:
-        """What mends a coarse integration, in a few words."""
+        """Remedy of a coarse integration, in a few words."""
         if self.suffices is None:
             return (
                 f"even substeps = {MAX_SUBSTEPS} is too few: replace the fast states by what they "

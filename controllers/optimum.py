@@ -153,7 +153,7 @@ def write_optimum(
 
 
 def solution_document(optimum: Optimum | PeriodicOptimum, key: str) -> dict[str, Any]:
-    """What a file says of a solution of any kind, beside its arrays.
+    """Description of a solution of any kind in a file, beside its arrays.
 
     Args:
         optimum: The solution.
@@ -242,7 +242,7 @@ def read_solution(
 
 
 def solution_fields(arrays: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
-    """What `solution_document` and the grid's axes give of a solution, by its attributes.
+    """Attributes of a solution from `solution_document` and the grid's axes.
 
     Args:
         arrays: Of a file.
@@ -503,7 +503,7 @@ class OptimalPolicy:
     """
 
     given = "truth"
-    """What `feedback` takes, under sensors too: regret is against who sees the state."""
+    """Input of `feedback`, under sensors too: the optimum sees the state."""
 
     name = "optimal"
 
@@ -813,7 +813,7 @@ class QuasiStaticPolicy:
     """
 
     given = "truth"
-    """What `feedback` takes, under sensors too: regret is against who sees the state."""
+    """Input of `feedback`, under sensors too: the optimum sees the state."""
 
     name = "optimal"
 

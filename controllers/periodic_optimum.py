@@ -259,7 +259,7 @@ class PeriodicPolicy:
     """
 
     given = "truth"
-    """What `feedback` takes, under sensors too: regret is against who sees the state."""
+    """Input of `feedback`, under sensors too: the optimum sees the state."""
 
     name = "optimal"
 

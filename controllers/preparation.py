@@ -838,7 +838,7 @@ class Exact(GaussNewton):
         return curvature.part("D").reshape(self.L.shape)
 
     def _lift(self, blocks: Vector) -> Vector:
-        """What lifts the eigenvalues of blocks (N, n+m, n+m) to the floor; keeps their spectrum."""
+        """Lift of the eigenvalues of blocks (N, n+m, n+m) to the floor; keeps their spectrum."""
         values, vectors = np.linalg.eigh(blocks * self.metric)
         floor = self.FLOOR * self.discounts
         self.spectrum = Spectrum(values, vectors, floor, self._ranges)
@@ -885,7 +885,7 @@ def _curvature_by_stage(problem: Problem, blocks: ThetaBlocks) -> Definition:
 
 @built_once
 def signal_costs(problem: Problem, blocks: ThetaBlocks) -> Definition:
-    """What signals change of the linear terms of the QP's costs, and of their constant.
+    """Change by signals of the linear terms of the QP's costs, and of their constant.
 
     A reference that moves by Δ_k makes the cost ℓ_θ(w − Δ_k). What prices change of the economic
     cost is linearised at (x_k, u_k); the exact Hessian has its curvature.

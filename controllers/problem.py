@@ -347,7 +347,7 @@ class Varying(NamedTuple):
 
 
 def varying_quantities(scenario: Scenario, model: Model) -> tuple[Varying, ...]:
-    """What the signals of a scenario that a controller knows of are to its problem.
+    """Roles of a scenario's known signals in a controller's problem.
 
     Args:
         scenario: Has the signals, bounds and reference.
@@ -678,7 +678,7 @@ class Problem:
 
     @cached_property
     def scale(self) -> Scale:
-        """What the controller's QP is scaled by."""
+        """Scales of the controller's QP."""
         return Scale.from_problem(self)
 
     @cached_property

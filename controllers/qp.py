@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 
 
 LEAST_SIZE = 1e-30
-"""What a size is at least, so that it can divide."""
+"""Least size, so that it can divide."""
 NOT_CONVEX = "not convex"
 """Status of the QpError of a QP whose Hessian is not positive definite."""
 

@@ -216,7 +216,7 @@ def soft_bounds(problem: Problem, blocks: ThetaBlocks, theta: ca.MX) -> list[dic
 
 
 def _scaled_bounds(problem: Problem) -> ca.Function:
-    """What `soft_bounds` has of one state, from θ's bounds and weights in the model's units."""
+    """Entries of `soft_bounds` for one state, from θ's bounds and weights in the model's units."""
     n = problem.n_states
     scale = problem.scale
     x_s = ca.DM(problem.reference_state)

@@ -215,7 +215,7 @@ class _Sensitivities:
         return {"first_xi": xi[0], "last_xi": last_xi}
 
     def _references(self, inputs: Mapping[str, ca.MX]) -> list[ca.MX]:
-        """How far the cost's reference is from the problem's at the stages 0 … N."""
+        """Distance of the cost's reference from the problem's at the stages 0 … N."""
         parts = given_parts(self.problem, self.blocks, inputs["theta"])
         return moved_references(self.problem, parts["sigma"])
 

@@ -661,7 +661,7 @@ def stage_columns(
     blocks: ThetaBlocks,
     given: ca.MX,
 ) -> ca.MX:
-    """What the functions of the stages 0 … N−1 are given in the place of θ, side by side.
+    """Inputs of the functions of the stages 0 … N−1 in place of θ, side by side.
 
     Args:
         problem: The problem.
@@ -718,7 +718,7 @@ def true_bounds(problem: Problem, symbols: Symbols) -> tuple[ca.SX, ca.SX] | Non
 
 
 def moved_references(problem: Problem, sigma: Expression) -> list[Expression]:
-    """How far the cost's reference is from the problem's at the stages 0 … N, (n+m,) each.
+    """Distance of the cost's reference from the problem's at the stages 0 … N, (n+m,) each.
 
     Args:
         problem: The problem.

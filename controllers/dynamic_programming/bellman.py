@@ -373,7 +373,7 @@ class BellmanOperator:
         actions: Array,
         grid: Grid,
     ) -> tuple[sparse.csr_array, Array]:
-        """Where actions lead, whatever a sample costs.
+        """Next states of actions, independent of the cost.
 
         Args:
             states: States, (B, n).

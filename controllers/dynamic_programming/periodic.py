@@ -44,7 +44,7 @@ FIRST_REACH = 0.06
 """Half width of the first box of actions about the still plant's policy, as a share of the
 actuators' range."""
 WIDENING = 1.0
-"""What a box whose edge is touched grows on either side, as a share of its width."""
+"""Growth on either side of a box whose edge is touched, as a share of its width."""
 MARGIN = 0.25
 """What the last box of actions is wider than the policy of all phases, as a share of its range."""
 LEAST_MARGIN = 0.01
@@ -121,7 +121,7 @@ class ActionBoxes(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """What a sample costs and where it leads, at the nodes of the boxes: r^m for each state.
+    """Costs and next states at the nodes of the boxes: r^m for each state.
 
     Attributes:
         transition: weights of the grid's states, (r^m · G, G).
@@ -204,7 +204,7 @@ def node_costs(
     boxes: ActionBoxes,
     n_nodes: int,
 ) -> Nodes:
-    """What a sample costs and where it leads at the nodes of the boxes.
+    """Costs and next states at the nodes of the boxes.
 
     Args:
         periodic: The plant.

@@ -40,7 +40,7 @@ STATUSES = (
 
 @dataclass(frozen=True)
 class Observer:
-    """What makes a state of an exported controller's inputs.
+    """Filter that turns an exported controller's inputs into a state.
 
     Attributes:
         rule: The file that defines the type Observer and its functions in C.
@@ -186,7 +186,7 @@ def controller_sources(
 
 
 def why_not_in_c(functions: SampleFunctions) -> str | None:
-    """What of a controller's model keeps it from being C (`not_in_c`); None where nothing does."""
+    """Part of a controller's model that cannot be C (`not_in_c`); None if all can."""
     return not_in_c(_written(functions))
 
 

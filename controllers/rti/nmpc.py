@@ -52,7 +52,7 @@ from cosim.core.scenario import Scenario
 
 
 class LinearisationPoint(NamedTuple):
-    """Where a QP is linearised: states x (N, n), actions u (N, m), costates (N, n).
+    """Linearisation point of a QP: states x (N, n), actions u (N, m), costates (N, n).
 
     The state at stage N is not needed since the terminal cost is quadratic; the costates χ_1 … χ_N
     matter for the exact Hessian only.
@@ -122,7 +122,7 @@ class Prepared:
 
     @cached_property
     def point(self) -> LinearisationPoint:
-        """Where the QP is linearised."""
+        """Linearisation point of the QP."""
         horizon = self.functions.problem.horizon
 
         def stages(name: str) -> Matrix:
@@ -1054,7 +1054,7 @@ class RtiNmpc:
         )
 
     def _hint(self) -> str:
-        """What may be the cause of a QP without a solution: a coarse integration."""
+        """Possible cause of a QP without a solution: a coarse integration."""
         integration = self._functions.integration
         if not integration.coarse:
             return ""

@@ -93,7 +93,7 @@ class ActionSlopes(NamedTuple):
 
 
 class ValueSlopes(NamedTuple):
-    """How Q of K samples depends on the action, in the actions' ranges, at the policy's action.
+    """Slope and curvature of Q in the action at K samples, in the actions' ranges.
 
     Attributes:
         cost: slope of the stage cost, (K, m).
@@ -109,7 +109,7 @@ class ValueSlopes(NamedTuple):
 
 
 class PolicyGradient(NamedTuple):
-    """What a batch of K samples says of the policy.
+    """Estimates about the policy from a batch of K samples.
 
     θ counts in its prior deviations, actions in their ranges.
 

@@ -1,4 +1,4 @@
-"""What a learning rule is: its input, a `Transition`, its output, an `Update`, and its base class.
+"""Interface of a learning rule: a `Transition` in, an `Update` out, and the base class.
 
 The loop of plant, controller and rule is `learning.loop`.
 """

@@ -477,7 +477,7 @@ class BackOffSearch:
         return best, False
 
     def _estimate(self, bound: int, reach: float) -> CostEstimate:
-        """What the samples say of the cost at other κ of a bound.
+        """Estimated cost at other κ of a bound.
 
         Args:
             bound: whose κ were tried.

@@ -226,7 +226,7 @@ class GuessedPlant:
 
 
 def _transition(sample: Sample, scenario: Scenario) -> Transition | None:
-    """What a search reads of a greedy sample; None after a failed solve."""
+    """Quantities of a greedy sample for a search; None after a failed solve."""
     solution: Any = sample.solution
     if solution is None:
         return None

@@ -193,7 +193,7 @@ class BatchQLearning(ValueRule):
         self._mean = self._present
 
     def state_dict(self) -> State:
-        """What `ValueRule` keeps, the open batch, and the posterior."""
+        """State of `ValueRule`, the open batch, and the posterior."""
         return {
             **super().state_dict(),
             **prefixed("buffer", self._buffer.state_dict()),

@@ -37,7 +37,7 @@ ExplorationDecay = Annotated[
 
 
 class Hyperparameter(NamedTuple):
-    """What `--explain` says of a hyperparameter, in words."""
+    """Description of a hyperparameter for `--explain`."""
 
     name: str
     default: str
@@ -207,7 +207,7 @@ def _value(text: str) -> Any:
 
 
 def _allowed(schema: Mapping[str, Any]) -> str:
-    """What a JSON schema allows, in words: a range, a choice, or a type."""
+    """Allowed values of a JSON schema, in words: a range, a choice, or a type."""
     if "anyOf" in schema:
         return " or ".join(_allowed(part) for part in schema["anyOf"])
     if "enum" in schema:

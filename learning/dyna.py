@@ -122,7 +122,7 @@ class Dyna(QLearning):
         return update_without_fit(blocks, before, controller.theta)
 
     def state_dict(self) -> State:
-        """What Q-learning keeps, the data and the model."""
+        """State of Q-learning, the data and the model."""
         return {
             **super().state_dict(),
             **prefixed("data", self._data.state_dict()),

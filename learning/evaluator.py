@@ -115,7 +115,7 @@ class Evaluator:
         return self._evaluation
 
     def _metrics(self, costs: dict[str, Array]) -> dict[str, Any]:
-        """What `evaluate` returns of the indicators of the seeds, (K,) each."""
+        """Result of `evaluate` from the indicators of the seeds, (K,) each."""
         J = costs["J"]
         excess = regret(J, self._optimal_costs)
         # A start that is the optimum leaves no gap.
@@ -144,7 +144,7 @@ class Evaluator:
         return self._law
 
     def _key(self, parameters: Parameters) -> tuple[Any, ...]:
-        """What the costs at a θ depend on."""
+        """Inputs of the costs at a θ."""
         run = self._run
         return (
             run.scenario.hash,
@@ -194,7 +194,7 @@ def number_if_known(value: float) -> float | None:
 
 
 def _nothing_known() -> dict[str, Any]:
-    """What `evaluate` returns where no held-out run is made."""
+    """Result of `evaluate` without a held-out run."""
     names = (*METRICS, "failures", "difference")
     numbers: dict[str, Any] = dict.fromkeys(names, nan)
     return {

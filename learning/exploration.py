@@ -99,7 +99,7 @@ class Strategy:
         return mean + (centres - actions)
 
     def _centre(self, action: Vector) -> Vector:
-        """Where the noise is added: c."""
+        """Centre of the noise: c."""
         if self.kind == "literal":
             return np.zeros_like(action)
         return action

@@ -46,7 +46,7 @@ LogVerdict = Literal["better", "cannot tell"]
 
 
 class KnownParameter(NamedTuple):
-    """What the log says of a parameter, or a nominal disturbance, of the model.
+    """Estimate of a parameter, or a nominal disturbance, of the model from the log.
 
     Attributes:
         name: its name.
@@ -75,7 +75,7 @@ class Direction(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class TrainingFromData(Shown):
-    """What a log has taught.
+    """Result of learning from a log.
 
     Attributes:
         run: the training's rule, scenario, settings and start.
@@ -145,7 +145,7 @@ class TrainingFromData(Shown):
 
     @property
     def experiment(self) -> str:
-        """What would tell, in a sentence; empty where the verdict is `better`."""
+        """Experiment that would tell, in a sentence; empty where the verdict is `better`."""
         if self.verdict == "better":
             return ""
         differences = (self.against_start, self.against_logged)
@@ -541,7 +541,7 @@ def _known_parameters(
     model: EmpiricalModel,
     settings: EmpiricalModelConfiguration,
 ) -> tuple[tuple[KnownParameter, ...], tuple[Direction, ...]]:
-    """What the log says of each parameter, and of directions of them, least shown first.
+    """Estimates of each parameter, and of directions of them, least known first.
 
     Args:
         problem: names parameters and nominal disturbances.
@@ -570,7 +570,7 @@ def _known_parameters(
 
 
 def excitation(data: LoggedData, scenario: Scenario) -> dict[str, float]:
-    """How much of each action's movement does not follow from the states, as a share of its range.
+    """Part of each action's movement that the states do not explain, as a share of its range.
 
     A controller that adds nothing of its own repeats what the states say, so that its log tells the
     actions' effect from the disturbances' by the model alone.

@@ -1,4 +1,4 @@
-"""What a rule that simulates knows of a scenario's signals, at its samples and at coming ones."""
+"""Known signals of a scenario for a rule that simulates, at its samples and at coming ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from learning.signal_costs import SignalCosts
 
 
 class SignalsOfSamples(NamedTuple):
-    """What T samples in a row meet of the signals.
+    """Values of the signals in T samples in a row.
 
     Attributes:
         stages: what is known at each sample of the problem's varying quantities at the stages
@@ -91,7 +91,7 @@ class KnownSignals:
         self._n_kept += 1
 
     def inputs_of(self, known: Known | None) -> Array:
-        """What signals give of the model at a sample, v, (n_v,).
+        """Inputs of the model that signals give at a sample, v, (n_v,).
 
         Args:
             known: what is known of the signals at the sample; None without signals.
@@ -118,7 +118,7 @@ class KnownSignals:
         return lower, upper
 
     def price_costs(self, inputs: Array) -> Array:
-        """What prices alone change of the stage cost at the reference, (K,).
+        """Change of the stage cost at the reference by prices alone, (K,).
 
         Args:
             inputs: v of K samples, (K, n_v).
@@ -178,7 +178,7 @@ class KnownSignals:
         return stages
 
     def state_dict(self) -> State:
-        """What was known at the samples that are kept."""
+        """Known values at the stored samples."""
         return {
             "stages": self._stages,
             "numbers": self._numbers,

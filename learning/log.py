@@ -9,7 +9,7 @@ from controllers.theta import Parameters
 from cosim.core.result import csv_text
 
 METRICS = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
-"""What an evaluation says of a greedy policy, means over its runs (failures: their sum)."""
+"""Evaluation of a greedy policy, means over its runs (failures: their sum)."""
 LOG_COLUMNS = (
     "samples", "updates", "J", "td_error", "step", "smallest_eigenvalue", "corrected", "refused",
     "retreats",

@@ -1,4 +1,4 @@
-"""What of a log is used to learn from, and which log is refused.
+"""Selection of a log's samples for learning, and refusal of unfit logs.
 
 Only the nominal model is asked. It says whether the log's columns, rows and units are those of its
 plant, which readings no plant has, and since when the plant is the present one.
@@ -81,7 +81,7 @@ def inputs_and_outputs(data: LoggedData, features: Features) -> tuple[Array, Arr
 
 
 def _nominal(features: Features, inputs: Array) -> tuple[Array, Array]:
-    """What the nominal model predicts at inputs (M, n+m), and the errors' sizes h, (M, K)."""
+    """Predictions of the nominal model at inputs (M, n+m), and the errors' sizes h, (M, K)."""
     no_errors = np.zeros(features.n_parameters)
     y, _, h = features(inputs, no_errors)
     return y, h
@@ -100,7 +100,7 @@ def _nominal_cost(inputs: Array, features: Features) -> Array:
 
 
 class _Errors(NamedTuple):
-    """What the nominal model does not explain of M transitions' states, over h.
+    """Prediction errors of the nominal model at M transitions' states, over h.
 
     Attributes:
         errors: (M, n).
@@ -282,7 +282,7 @@ def _shifts(largest: int) -> list[int]:
 
 
 def _in_words(shift: int) -> str:
-    """What a shift of the inputs says of the log."""
+    """Text about a shift of the inputs."""
     way = "late" if shift > 0 else "early"
     rows = "row" if abs(shift) == 1 else "rows"
     return f"the inputs are logged {abs(shift)} {rows} {way}"

@@ -17,7 +17,7 @@ Stretches = Annotated[int, Field(ge=2, le=50)]
 
 
 class LogConfiguration(BaseModel):
-    """What of a log is refused or left out, and how surely its prediction must tell."""
+    """Limits for refusing a log or leaving out samples, and the level of its verdict."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

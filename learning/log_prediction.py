@@ -1,4 +1,4 @@
-"""What θ would have cost on the disturbances of a log.
+"""Predicted cost of θ on the disturbances of a log.
 
 The model's errors are played back in their order, so that under the logged actions it repeats the
 log, and two controllers meet the same. This is done for draws from the posterior of the model's
@@ -39,7 +39,7 @@ class PredictedCosts(NamedTuple):
 
 
 class Expectation:
-    """What a model expects of the samples of a rollout, as shares in the mean cost.
+    """Expected costs of the samples of a rollout, as shares in the mean cost.
 
     An error of the log has two parts in the mean: it moved the states that followed, and it is one
     of the errors over which each sample's penalty is expected. A rare error makes most of a

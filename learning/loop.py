@@ -145,7 +145,7 @@ class TrainingLoop:
 
     @property
     def known_state(self) -> Vector:
-        """What a rule may know of the present state, (n,): under sensors the estimate."""
+        """Present state for a rule, (n,): under sensors the estimate."""
         if self._loop.y is None:
             return self._loop.s
         estimate: Vector = self.law.estimate  # type: ignore[attr-defined]
@@ -153,14 +153,14 @@ class TrainingLoop:
 
     @property
     def penalty(self) -> Penalty:
-        """That of the bounds as they are at the present sample."""
+        """Penalty by the bounds of the present sample."""
         if self.signals is None:
             return self._still_penalty
         return self.signals.penalty(self._loop.number)
 
     @property
     def known_penalty(self) -> float:
-        """What a rule may know of the present state's penalty: under sensors its expectation."""
+        """Present penalty for a rule: under sensors its expectation."""
         s = self.known_state
         variances = self._estimate_variances
         if variances is None:

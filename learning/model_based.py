@@ -212,13 +212,13 @@ class ModelBased(Algorithm):
         # Of the mean cost, for each window of the change detection.
         self._limits: Array = np.full(len(settings.change_windows), np.inf)
         self.predicted_cost = float("nan")
-        """What the model predicts of θ, mean cost per sample; NaN before the first update."""
+        """Predicted mean cost per sample of θ; NaN before the first update."""
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
 
     @property
     def changes(self) -> int:
-        """How often the plant was taken for another one."""
+        """Number of detected changes of the plant."""
         return self._data.changes
 
     @property
@@ -290,7 +290,7 @@ class ModelBased(Algorithm):
         return changed or bool(too_costly)
 
     def _signals_of(self, inputs: Array) -> Array:
-        """What signals give of the model in inputs (s, a, v), (M, n_v)."""
+        """Inputs of the model that signals give, from (s, a, v), (M, n_v)."""
         n_before = self._features.n_inputs - self._features.n_signals
         return inputs[:, n_before:]
 
@@ -493,7 +493,7 @@ class ModelBased(Algorithm):
 
 
 class PredictedCost(NamedTuple):
-    """What a model predicts of a θ.
+    """Prediction of a model for a θ.
 
     Attributes:
         cost: mean per sample; infinite where the rollout is lost.
@@ -650,7 +650,7 @@ class BackOffOnModel:
         return self._base.replace({"x_l": lower, "x_u": upper}).theta
 
     def predicted_costs(self, thetas: Sequence[Array]) -> list[PredictedCost]:
-        """What the model predicts of each θ, (n_θ,) each; infinite where the rollout is lost."""
+        """Predicted cost of each θ, (n_θ,) each; infinite where the rollout failed."""
         keys = [theta.tobytes() for theta in thetas]
         new = {}
         for key, theta in zip(keys, thetas, strict=True):
@@ -668,7 +668,7 @@ class BackOffOnModel:
         return [self._known[key] for key in keys]
 
     def _predicted_cost(self, samples: RolloutSamples) -> PredictedCost:
-        """What the samples of a rollout say of its θ."""
+        """Prediction of a θ from the samples of a rollout."""
         settings = self._settings
         self.n_samples += len(samples.inputs)
         # A rollout counts once it has settled.
@@ -706,7 +706,7 @@ class BackOffOnModel:
         return PredictedCost(cost, derivative, limits, float(price_costs.mean()))
 
     def _limits_of(self, costs: Array) -> Array:
-        """What the plant may cost before a prediction (M,) is called wrong, for each window."""
+        """Cost above which a prediction (M,) is called broken, for each window."""
         settings = self._settings
         cost = float(costs.mean())
         worst = []
@@ -719,7 +719,7 @@ class BackOffOnModel:
 
     @property
     def _lost(self) -> PredictedCost:
-        """What is predicted of a rollout that is lost."""
+        """Prediction of a rollout that failed."""
         derivative = np.zeros_like(self._model.mean)
         limits = np.full(len(self._settings.change_windows), np.inf)
         return PredictedCost(np.inf, derivative, limits, 0.0)

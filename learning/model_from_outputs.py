@@ -85,7 +85,7 @@ class ModelFromOutputs(Algorithm):
         self._count = 0
         self._due = max(settings.first_update, settings.least_samples)
         self.predicted_cost = float("nan")
-        """What the fitted plant costs at θ, mean per sample; NaN before the first update."""
+        """Mean cost per sample of the fitted plant at θ; NaN before the first update."""
 
     def observe(self, transition: Transition) -> Update | None:
         """Keep a sample's readings; move θ when an update is due."""
@@ -217,7 +217,7 @@ class ModelFromOutputs(Algorithm):
 
 
 class SimulatedCost(NamedTuple):
-    """What a rollout behind the filter costs.
+    """Cost of a rollout behind the filter.
 
     Attributes:
         mean: per sample; infinite where a QP failed or the loop ran away.
@@ -385,7 +385,7 @@ class FittedPlant:
         return SimulatedCost(mean, by_bound, deviation)
 
     def _measured(self, s: Vector) -> list[float]:
-        """What the sensors' variables are at a state (n,), (n_y,)."""
+        """Values of the sensors' variables at a state (n,), (n_y,)."""
         readings = self._filter.expected_readings(s, self._p)
         values: list[float] = readings.tolist()
         return values

@@ -21,7 +21,7 @@ from learning.empirical_model import EmpiricalModel, EmpiricalModelConfiguration
 
 
 class Predictions(NamedTuple):
-    """What a model says of T samples, and what became of them.
+    """Predictions of a model for T samples, and the outcomes.
 
     Attributes:
         outputs: predicted (s₊, ℓ) without residual, with what persists of the error before, (T, K).

@@ -487,7 +487,7 @@ class QLearning(ValueRule):
         self._sum_of_squares = 0.0
 
     def state_dict(self) -> State:
-        """What `ValueRule` keeps, the warm-up's rows, and the regression."""
+        """State of `ValueRule`, the warm-up's rows, and the regression."""
         return {
             **super().state_dict(),
             **prefixed("regression", self._regression.state_dict()),

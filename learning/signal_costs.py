@@ -1,4 +1,4 @@
-"""What prices that move change of costs and values by themselves, whatever a controller does.
+"""Changes of costs and values by moving prices alone, independent of the controller.
 
 A price's change by the hour moves the cost of every sample, and at N samples ahead that of the
 predicted ones: a learning rule would take this for an error of V. At the reference it is known.
@@ -16,7 +16,7 @@ from cosim.core.signals import Known
 
 
 class SignalCosts:
-    """What known prices change of the economic cost at the reference.
+    """Change of the economic cost at the reference by known prices.
 
     Args:
         problem: Has the prices among its varying quantities, or none.

@@ -167,7 +167,7 @@ class Training(Result):
 
     @property
     def retreats(self) -> int:
-        """How often θ went back to one that had been shown to cost less."""
+        """Number of retreats to a θ that was shown to cost less."""
         return int(_total(row["retreats"] for row in self.rows))
 
     @property

@@ -1,4 +1,4 @@
-"""What a training is: its identity, its start, and its loop at the start."""
+"""Set-up of a training: its identity, its start, and its loop at the start."""
 
 from __future__ import annotations
 
@@ -376,7 +376,7 @@ def _retreat(
     rule: Algorithm,
     start: Vector,
 ) -> Retreat | None:
-    """What compares a run's shifts; None for a rule that tries θ, on the plant or a simulator."""
+    """Comparison of a run's shifts; None for a rule that tries θ, on the plant or a simulator."""
     configuration = run.configuration
     tries = rule.requires == "simulator" or hasattr(rule, "theta")
     if tries or not configuration.retreat_probability:

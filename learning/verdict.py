@@ -17,7 +17,7 @@ WORSE: Verdict = "worse: the start was kept"
 
 
 def verdict(difference: Estimate) -> Verdict:
-    """What a difference of mean costs shows.
+    """Verdict on a difference of mean costs.
 
     Args:
         difference: J after a training less J of its start, on the same noise, with its interval.

@@ -32,7 +32,7 @@ _VARIABLE = (
     "max",
     "description",
 )
-"""What is said of a variable."""
+"""Attributes of a variable in the report."""
 
 
 def description_of(fmu: Path) -> ModelDescription:
@@ -128,7 +128,7 @@ def validate(fmu: Path) -> str:
 
 
 def problems_of(fmu: Path) -> list[str]:
-    """What an FMU, a file or an unpacked folder, has against FMI's rules of its description."""
+    """Violations of FMI's rules in the description of an FMU, a file or an unpacked folder."""
     lines = []
     for problem in validate_fmu(str(fmu)):
         # One line each: those of lxml have several.

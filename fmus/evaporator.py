@@ -53,7 +53,7 @@ BUILD_FILE = "extra/org.rti-cosim/build.json"
 
 
 def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
-    """How the binaries were made (JSON): for each platform the compiler and its flags."""
+    """Build record of the binaries (JSON): for each platform the compiler and its flags."""
     platforms = {}
     for compiler in compilers(every_platform):
         platforms[compiler.platform.tuple] = {

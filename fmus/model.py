@@ -523,7 +523,7 @@ def _real_attributes(
 
 
 def _numbering(version: FmiVersion, model: FmuModel) -> Callable[[str], int]:
-    """How the description points to a variable: FMI 2.0 by its position, from 1."""
+    """Reference to a variable in the description: FMI 2.0 by its position, from 1."""
     if version == 3:
         return model.value_reference
     names = [variable.name for variable in model.exported(2)]

@@ -1,4 +1,4 @@
-"""What an FMU's model description declares of its memory: continuous states, time constants."""
+"""Declared memory of an FMU: continuous states, time constants."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 @cache
 def _variables(fmu: Path) -> tuple[bool, tuple[ElementTree.Element, ...]]:
-    """Whether an FMU is FMI 2.0, and its variables; none where the file cannot be read."""
+    """True for FMI 2.0, and the variables; none where the file cannot be read."""
     try:
         with zipfile.ZipFile(fmu) as archive:
             root = ElementTree.fromstring(archive.read("modelDescription.xml"))

@@ -56,14 +56,15 @@ class BackOffConfiguration(GreedyConfiguration):
     )
     reach: Positive = Field(
         1.0,
-        description="how far, in κ, a sample speaks for another back-off; twice that in the coarse "
-        "round",
+        description=(
+            "distance in κ over which a sample counts for another back-off; twice that in "
+            "the coarse round"
+        ),
     )
     resolution: Positive = Field(0.01, description="step of κ")
     plateau: Positive = Field(
         1e-6,
-        description="estimated costs that differ by this share are one, so that no last digit "
-        "decides",
+        description="share by which estimated costs must differ to be told apart",
     )
     active_share: Share = Field(
         0.05,

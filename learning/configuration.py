@@ -21,7 +21,7 @@ Count = Annotated[int, Field(ge=1)]
 # The rules differ in these four, so they have other defaults in each.
 ModelParameters = Annotated[
     tuple[str, ...],
-    Field(description='parameters of the controller\'s model that θ has; all of them by ["all"]'),
+    Field(description='parameters of the controller\'s model in θ; ["all"]: all of them'),
 ]
 ExplorationProbability = Annotated[Share, Field(description="share of samples that explore")]
 ExplorationShare = Annotated[
@@ -30,8 +30,9 @@ ExplorationShare = Annotated[
 ExplorationDecay = Annotated[
     Count | None,
     Field(
-        description="samples T after which the share that explores falls, by T/k at the k-th; it "
-        "stays if not given",
+        description=(
+            "samples T after which the share that explores falls as T/k; constant if not given"
+        ),
     ),
 ]
 
@@ -57,11 +58,11 @@ class Configuration(BaseModel):
 
     parametrisation: Literal["paper", "extended"] = Field(
         "extended",
-        description="θ of the paper, or that and the slack weights of the predicted stages",
+        description="θ of the paper, or extended by the slack weights of the predicted stages",
     )
     value_offset: Literal["stage-cost", "discounted"] = Field(
         "discounted",
-        description="c_lambda at the start: ℓ_s (paper) or ℓ_s/(1−γ), unless the scenario says",
+        description="c_lambda at the start, if the scenario has none: ℓ_s (paper) or ℓ_s/(1−γ)",
     )
     model_parameters: ModelParameters = ()
     smallest_eigenvalue: Positive = Field(
@@ -70,8 +71,10 @@ class Configuration(BaseModel):
     )
     retreat_probability: Share = Field(
         3e-4,
-        description="probability by which a shift's cost is above the least one shown, though both "
-        "are the same, below which θ goes back to that; 0: it never does",
+        description=(
+            "level of the test that a shift costs more than the cheapest one; θ then goes "
+            "back; 0: never"
+        ),
     )
     shift_hours: Positive = Field(8.0, description="hours of a shift")
     exploration: Literal["additive", "literal", "none"] = Field(
@@ -84,7 +87,9 @@ class Configuration(BaseModel):
     exploration_decay_after: ExplorationDecay = None
     exploration_deviation: tuple[NonNegative, ...] | None = Field(
         None,
-        description="in place of the share: σ of e in the units of u, one or one per action",
+        description=(
+            "σ of e in the units of u, one or one per action; takes the place of the share"
+        ),
     )
 
     @classmethod
@@ -165,7 +170,7 @@ class GreedyConfiguration(Configuration):
 
     exploration: Literal["none"] = Field(
         "none",
-        description="none: it is θ that is tried, not actions",
+        description="none: the rule tries θ, not actions",
     )
 
     def for_scenario(self, scenario: Scenario) -> Self:

@@ -28,8 +28,10 @@ class DynaConfiguration(QLearningConfiguration, EmpiricalModelConfiguration):
     exploration_decay_after: ExplorationDecay = None
     exploration_samples: Count = Field(
         480,
-        description="samples of the plant that explore after the start and after a change of it; "
-        "those of the model always may",
+        description=(
+            "samples of the plant that explore after the start and after a change; those "
+            "of the model always may"
+        ),
     )
 
 

@@ -87,20 +87,22 @@ class EmpiricalModelConfiguration(Configuration):
     )
     refit_growth: Count = Field(
         8,
-        description="a model is fitted anew where its data have grown by one in so many",
+        description="growth of the data after which the model is fitted again: one in so many",
     )
     change_windows: tuple[Count, Count, Count, Count] = Field(
         (15, 60, 240, 960),
-        description="latest samples over whose means a change of the plant is looked for, every "
-        "time that the first number of samples has come",
+        description=(
+            "windows of latest samples whose means are tested for a change of the plant, "
+            "each time that the first number of samples has come"
+        ),
     )
     change_probability: Share = Field(
         1e-7,
-        description="probability of a window's mean error below which the plant is another one",
+        description="probability of a window's mean error below which the plant has changed",
     )
     suspicion_probability: Share = Field(
         1e-4,
-        description="the same where the window costs more than was predicted, too",
+        description="the same for a window that also costs more than predicted",
     )
     forecast_samples: Count = Field(
         240,

@@ -41,7 +41,7 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
 
     model_parameters: ModelParameters = ALL
     # under sensors (`learning.model_from_outputs`)
-    noise: bool = Field(True, description="θ has the variances of the estimator, under sensors")
+    noise: bool = Field(True, description="put the estimator's variances into θ, under sensors")
     noise_prior: Positive = Field(
         0.5,
         description="standard deviation of the prior of these variances' logarithms",
@@ -57,8 +57,7 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     )
     normal_errors: Count = Field(
         60,
-        description="number of errors of an estimate as which a normal law counts, beside those "
-        "that were seen",
+        description="weight of the estimate's normal law, in numbers of observed errors",
     )
     back_off_step: Positive = Field(
         1.0,
@@ -79,8 +78,10 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     exploration_samples: Count = Field(120, description="samples at the start that explore")
     settling_samples: Count = Field(
         30,
-        description="samples after an update whose cost is not held against the predicted one, "
-        "which is of a loop that has settled",
+        description=(
+            "samples after an update that are not compared with the predicted cost: the "
+            "loop settles"
+        ),
     )
     cost_excess: Positive = Field(
         1.5,
@@ -90,8 +91,10 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     # what back-offs are possible
     reserve_back_off: NonNegative = Field(
         18.0,
-        description="reserve back-off of a bound that is not active, in standard deviations of the "
-        "one-step error; half or none of it where that would cost",
+        description=(
+            "reserve back-off of an inactive bound, in standard deviations of the one- "
+            "step error; half of it or none if it raises the predicted cost"
+        ),
     )
     least_samples: Count = Field(
         120,
@@ -100,8 +103,10 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     )
     steady_samples: Count = Field(
         1440,
-        description="samples of a changed plant below which no back-off shrinks beneath what it "
-        "was before",
+        description=(
+            "samples after a change of the plant before a back-off may shrink below its "
+            "earlier value"
+        ),
     )
     shrink_share: Share = Field(
         0.7,
@@ -136,13 +141,17 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     # how a cost is predicted and compared
     tail_widening: NonNegative = Field(
         0.1,
-        description="share by which `tail_samples` errors are widened, for tails that they lack; "
-        "in proportion to the root of 1 / their number",
+        description=(
+            "share by which `tail_samples` errors are widened, for missing tails; it "
+            "falls with the root of their number"
+        ),
     )
-    tail_samples: Count = Field(120, description="number of errors at which it is that share")
+    tail_samples: Count = Field(120, description="number of errors to which tail_widening refers")
     recent_samples: Count = Field(
         1440,
-        description="latest samples that say where the plant is and how large errors are",
+        description=(
+            "latest samples from which the plant's states and the size of errors are taken"
+        ),
     )
     state_ranges: Positive = Field(
         2.0,
@@ -155,13 +164,13 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     )
     doubt: NonNegative = Field(
         1.0,
-        description="standard deviations of a difference of costs within which the model cannot "
-        "tell",
+        description="standard deviations within which two predicted costs count as equal",
     )
     persistent_doubt: NonNegative = Field(
         3.0,
-        description="the same where errors persist, of which the model knows the first order "
-        "alone; θ then moves only where its cost is below the present one by as much",
+        description=(
+            "the same where errors persist; θ then moves only to a cost that is lower by as much"
+        ),
     )
     plateau: Positive = Field(
         2e-5,
@@ -169,7 +178,9 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     )
     cost_thinning: Count = Field(
         10,
-        description="one in so many samples of a rollout says what the model knows of its cost",
+        description=(
+            "samples of a rollout between two at which the uncertainty of its cost is computed"
+        ),
     )
 
 

@@ -52,26 +52,29 @@ class ValueConfiguration(Configuration):
         None,
         gt=0,
         le=1,
-        description="discount of the TD error; if not given, 1 (the mean cost, which no sampling "
-        "time alters), and the scenario's for the rules td and fit",
+        description=(
+            "discount of the TD error; if not given, 1 (mean cost), and the scenario's "
+            "for the rules td and fit"
+        ),
     )
     prior_width: Positive = Field(
         0.15,
-        description="how far θ may be from its start, as a share of the start's cost",
+        description="prior width of θ about its start, as a share of the start's cost",
     )
     level_width: Positive = Field(
         0.16,
-        description="width of c_lambda as a share of V's level, which is all that it carries",
+        description="prior width of c_lambda, as a share of V's level",
     )
     offset_width: Positive = Field(
         0.02,
-        description="width of c_f in standard deviations of e: its mean is measured, the TD error "
-        "need not say it",
+        description="prior width of c_f, in standard deviations of e",
     )
     back_off_width: Positive = Field(
         2.0,
-        description="width of x_l and x_u in standard deviations of e at a prior_width of 0.3; "
-        "in proportion to that",
+        description=(
+            "prior width of x_l and x_u, in standard deviations of e at prior_width = "
+            "0.3, and in proportion to it"
+        ),
     )
     slow_state_share: NonNegative = Field(
         0.3,
@@ -89,8 +92,9 @@ class ValueConfiguration(Configuration):
     )
     measure_offset: bool = Field(
         True,
-        description="c_f becomes the mean of the first prediction errors; false: it starts as it "
-        "is, for a start that has learned its offset",
+        description=(
+            "c_f begins as the mean of the first prediction errors; false: as the start has it"
+        ),
     )
     innovation_clip: Positive = Field(
         3.0,
@@ -143,11 +147,11 @@ class QLearningConfiguration(ValueConfiguration):
     )
     noise: bool = Field(
         False,
-        description="whether θ has the variances of the estimator, under sensors",
+        description="put the estimator's variances into θ, under sensors",
     )
     prior_samples: Count = Field(
         500,
-        description="samples of the warm-up, in which θ stays: they give noise and widths",
+        description="samples of the warm-up, without updates; they give noise and prior widths",
     )
     step_every: Count = Field(50, description="samples per step of θ")
     variance_memory: Positive = Field(
@@ -161,14 +165,16 @@ class QLearningConfiguration(ValueConfiguration):
     )
     gradient_mean_memory: NonNegative = Field(
         0.65,
-        description="where the mean cost follows δ, the running mean of ∇Q over this time, in "
-        "slowest time constants of the nominal model and ten samples at least, is taken off ∇Q, "
-        "for the level of Q means nothing; 0: it stays in",
+        description=(
+            "time of the running mean that ∇Q loses (the intercept), in slowest time "
+            "constants of the nominal model, at least ten samples; 0: no intercept"
+        ),
     )
     parameter_drift: NonNegative = Field(
         0.0,
-        description="variance that each sample adds to θ, in units of the prior's, so that "
-        "learning goes on where the plant changes",
+        description=(
+            "variance that each sample adds to θ, in units of the prior's, for plants that change"
+        ),
     )
     step_size: Positive = Field(1e-3, description="rules td and fit: α")
     scaled: bool = Field(

@@ -28,7 +28,8 @@ def compare(
         a: Run: its folder, trajectory.csv or .rrd.
         b: Run to compare it with.
         tolerance: NAME=VALUE in the signal's unit; repeatable.
-        relative: Tolerance of the others, per largest magnitude in A; the residual is left out.
+        relative: Tolerance of the other signals, as a share of the largest magnitude in A; the
+            residual is not compared.
         record: Write a Rerun recording with both overlaid.
     """
     with output(json) as out_:

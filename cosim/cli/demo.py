@@ -35,7 +35,7 @@ DRAWN = 300
 
 def demo(
     samples: Annotated[int, typer.Option("--samples", "-n", min=100, max=1_000_000)] = DAY_SAMPLES,
-    steps: cli.StepsOption = 1000,
+    steps: Annotated[int, cli.count("--steps")] = 1000,
     seed: cli.SeedOption = 0,
     pairs: PairsOption = False,
     out: cli.OutOption = Path("cosim-demo"),

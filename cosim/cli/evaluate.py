@@ -37,7 +37,7 @@ def evaluate(
     """Compare controllers on the same disturbances, seed by seed.
 
     Writes evaluation.csv (a row per controller and seed), summary.json, timing.csv, scenario.toml
-    and, with --plot, evaluation.png, together at the end. Every run is computed anew.
+    and, with --plot, evaluation.png, together at the end.
 
     Args:
         controllers: Comma-separated, or the option again: naive, tuned, backed-off, cautious,
@@ -45,9 +45,9 @@ def evaluate(
             another name.
         seeds: Number of seeds.
         first_seed: The first seed.
-        trajectories: In place of controllers: judge a folder of loops that another tool ran, one
-            CSV file a seed (run-7.csv) with the states and the actions applied.
-        plot: Draw evaluation.png too, which takes a second.
+        trajectories: In place of controllers: evaluate the runs of another tool, a folder with a
+            CSV file for each seed (run-7.csv) of states and applied actions.
+        plot: Draw evaluation.png too.
     """
     with cli.output(json) as out_:
         from cosim.evaluation import EVALUATION_FILES, PICTURE, named_controllers

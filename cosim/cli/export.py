@@ -26,15 +26,16 @@ def export(
 ) -> None:
     """Write an RTI-NMPC as a self-contained co-simulation FMU, or C, that needs no Python.
 
-    For Linux, Windows and macOS, x86_64 and ARM64 (pip install 'rti-cosim\\[cross]'); without that
-    package, or with --local, for this machine by its C compiler. θ are tunable parameters.
+    Builds for Linux, Windows and macOS, x86_64 and ARM64, with pip install 'rti-cosim\\[cross]'.
+    Without that package, or with --local, it builds for this machine by its C compiler. The entries
+    of θ are tunable parameters.
 
     Args:
         controller: naive, tuned or a parameters file (.toml) of a training.
         out: The FMU's file; with --format c a folder.
         format_: fmu, or c: one .c and .h, no FMI.
         single: With --format c: float in place of double.
-        measured: Disturbances that are inputs, as X1,T1.
+        measured: Disturbances that are inputs, such as X1,T1.
         fmi: FMI version: 2 or 3.
         local: Build for this machine alone, by $CC or cc.
         ssp: Write the loop with the plant here.

@@ -14,7 +14,7 @@ from cosim.cli.output import JsonOption, output, split_names, writable_folder
 MOST_ROWS = 1000
 """Variables of a table at most: a table of 200 000 takes minutes to print."""
 
-fmu_app = typer.Typer(help="Look into an FMU, check it, build ours.")
+fmu_app = typer.Typer(help="Inspect an FMU, check it, or build one.")
 
 FmuFileArgument = Annotated[str, typer.Argument()]
 
@@ -28,10 +28,10 @@ def _path(name: str) -> Path:
 
 @fmu_app.command("info")
 def show_fmu(file: FmuFileArgument = "evaporator", json: JsonOption = False) -> None:
-    """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant.
+    """Show an FMU's interfaces, platforms, flags and variables, and why it cannot be a plant.
 
     Args:
-        file: FMU file, or the name of a shipped one, evaporator_fmi3 or tanks, say.
+        file: FMU file, or the name of a shipped one, such as evaporator_fmi3 or tanks.
     """
     with output(json) as out_:
         from cosim.core.errors import PlantError
@@ -107,24 +107,24 @@ def check_fmu(
     tolerance: Annotated[float | None, typer.Option(min=1e-15, max=1e3)] = None,
     json: JsonOption = False,
 ) -> None:
-    """Find out whether an FMU can be a plant, and how, by trying it.
+    """Check by trials whether an FMU can be a plant.
 
-    The table says what was looked at, what was seen and what follows; the last line is the
-    verdict. Exit code 0: it can be a plant; 1: it cannot; 2: there is no such FMU. This runs the
-    FMU's native code.
+    The table has checks, findings and consequences; the last line is the verdict. Exit code 0: the
+    FMU can be a plant; 1: it cannot; 2: there is no such FMU. The check runs the FMU's native code.
 
-    With --model, the FMU is compared with a controller's model: next states, cost and outputs at
-    random points, the largest difference of each and where it is. Exit code 0: both agree; 1: they
-    do not; 2: bad input.
+    With --model, the FMU is compared with a controller's model at random points. The table has the
+    largest difference of next states, cost and outputs, and its place. Exit code 0: both agree;
+    1: they do not; 2: bad input.
 
     Args:
-        file: FMU file, or the name of a shipped one, evaporator_fmi3 or tanks, say.
+        file: FMU file, or the name of a shipped one, such as evaporator_fmi3 or tanks.
         model: Model to compare with, module:factory.
-        scenario: With --model: names the variables in place of the options, and bounds the points.
+        scenario: With --model: the scenario that names the variables and bounds the points.
         points: With --model: number of points; default 100.
         seed: With --model: seed of the points; default 0.
-        tolerance: With --model: share of what a quantity varies that may differ; default 0.001.
-        states: Names, comma-separated; without them as `scenario init` guesses.
+        tolerance: With --model: largest difference, as a share of the quantity's variation;
+            default 0.001.
+        states: Names, comma-separated; default: those that `scenario init` guesses.
         actions: Names, comma-separated.
         cost: Output that is the stage cost.
         sampling_time: Sampling time in s.

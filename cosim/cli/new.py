@@ -34,10 +34,9 @@ def new(
     out: cli.OutOption = Path(),
     json: cli.JsonOption = False,
 ) -> None:
-    """Write a skeleton that runs, and print the commands; replaces no file.
+    """Write a skeleton that runs, and print its commands; no file is replaced.
 
-    A rule and a controller are Python modules, a plant, its equations too; a study is
-    TOML.
+    A rule, a controller and a plant are Python modules; a study is a TOML file.
 
     Args:
         name: Name of files, module and class.

@@ -23,16 +23,16 @@ def optimum(
     recompute: Annotated[bool, typer.Option("--recompute")] = False,
     json: cli.JsonOption = False,
 ) -> None:
-    """Mean cost per sample J* of the optimal policy, by dynamic programming, with its bounds.
+    """Compute J*, the least possible mean cost per sample, by dynamic programming.
 
-    The policy is stored and serves as controller `optimal`. It is called J* where solution,
-    refinement and long simulation agree within 0.05 % and no policy search is below; else
-    it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
-    A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is. One
-    disturbance may have a memory; its value is then a state, and no controller has the policy.
+    The policy is stored and serves as the controller `optimal`. J* is certified if solution,
+    refinement and long simulation agree within 0.05 %, and no policy search is below. Otherwise it
+    is printed as a reference with its spread. With --refine the exit code is then 1.
+    A plant that fouls or jumps has a quasi-static reference: J* of the plant at each time. One
+    disturbance may have a memory: its value is then a state, and `optimal` is not available.
 
     Args:
-        refine: Solve, refine the grid, simulate the policy; keep the certificate.
+        refine: Solve, refine the grid and simulate the policy; store the certificate.
         recompute: Solve even if the policy is stored.
     """
     with cli.output(json) as out_:
@@ -237,11 +237,11 @@ def tuning(
     out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
     json: cli.JsonOption = False,
 ) -> None:
-    """Tune the NMPC's cost by economics (controller `tuned`) and say what came of it.
+    """Tune the NMPC's cost by economics (controller `tuned`), and print the result.
 
-    It says where the optimal steady state is, what each active bound costs, and whether a
-    quadratic had to be added to the cost. The certificate, with the eigenvalues of the Hessians
-    and the local feedback gains, is under --json.
+    The output has the optimal steady state, the price of each active bound, and the quadratic that
+    was added to the cost, if any. With --json it has the certificate: eigenvalues of the Hessians
+    and local feedback gains.
 
     Args:
         out: Write the tuned θ to this TOML file.

@@ -115,11 +115,10 @@ def draft(
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     json: cli.JsonOption = False,
 ) -> None:
-    """Draft a scenario for an FMU: a commented TOML file, to be read and corrected.
+    """Draft a scenario for an FMU: a commented TOML file for you to correct.
 
-    States, actions, cost, noise, ranges and what a reset can write are guessed from
-    modelDescription.xml; the steady state near the start values is found by stepping the FMU,
-    whose native code this runs.
+    States, actions, cost, noise, ranges and start parameters are guessed from modelDescription.xml.
+    The steady state near the start values is found by stepping the FMU, which runs its native code.
 
     Args:
         fmu: FMU: a path, or evaporator.
@@ -127,11 +126,11 @@ def draft(
         states: Names, comma-separated.
         actions: Names, comma-separated.
         cost: Output that is the stage cost.
-        model: The controller's model, module:factory; with one, penalties follow from the prices of
+        model: The controller's model, module:factory; penalties then follow from the prices of
             bounds.
         sampling_time: Sampling time in s.
-        state: Where to look for the steady state: numbers.
-        action: The same of the actions.
+        state: State near the steady state: numbers, comma-separated.
+        action: Action near the steady state: numbers, comma-separated.
         overwrite: Replace the file if it is there.
     """
     with cli.output(json) as out_:

@@ -25,11 +25,11 @@ def shadow(
     record: cli.RecordOption = False,
     json: cli.JsonOption = False,
 ) -> None:
-    """Show what a controller would have done on logged data, beside what was done.
+    """Show the actions that a controller would have applied to logged data.
 
     Writes shadow.csv, shadow.png (of up to 20 000 rows), summary.json, scenario.toml and, with
-    --record, shadow.rrd. No plant is stepped: the controller gets what was measured, and its
-    actions go nowhere.
+    --record, shadow.rrd. No plant is stepped: the controller gets the measurements, and
+    its actions are drawn beside the logged ones.
 
     Args:
         controller: naive, tuned, backed-off, cautious, lqr, pi, converged, optimal, a parameters

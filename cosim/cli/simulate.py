@@ -33,19 +33,18 @@ def simulate(
     """Run a controller on a scenario's plant.
 
     Writes trajectory.csv, timing.csv, summary.json, scenario.toml, with --plot trajectory.png and
-    with --record run.rrd. Of more than 100 000 samples trajectory.parquet and timing.parquet are
-    written in place of the CSV files, if pyarrow is installed: the same columns, which
-    pandas.read_parquet reads.
-    Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
-    are the same for the same command and seed.
+    with --record run.rrd. Beyond 100 000 samples the tables are trajectory.parquet and
+    timing.parquet with the same columns, if pyarrow is installed.
+    Times by the clock are in timing.csv and the summary's `timing`. All other bytes are the same
+    for the same command and seed.
 
-    Where the plant fails in mid run, the files hold the samples before, summary.json says under
-    `ended` why, and the exit code is 2.
+    If the plant fails, the files hold the samples before, `ended` in summary.json has the reason,
+    and the exit code is 2.
 
     Args:
         controller: naive, tuned, backed-off, cautious, lqr, pi, converged, optimal, a parameters
             file, or module:factory.
-        plot: Draw trajectory.png too, of 2 to 20 000 samples; it takes a second.
+        plot: Draw trajectory.png too, of 2 to 20 000 samples.
     """
     with cli.output(json) as out_:
         from cosim.core.errors import CosimError, PlantError

@@ -12,7 +12,7 @@ import cosim
 from cosim.cli import output as cli
 
 study_app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
-results_app = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
+results_app = typer.Typer(help="Check the stored studies, or update them.", no_args_is_help=True)
 
 StudyFileArgument = Annotated[Path, typer.Argument(show_default=False)]
 NamesArgument = Annotated[
@@ -31,8 +31,8 @@ def run_study(
     """Train and evaluate every case on every scenario with every training seed.
 
     Writes evaluation.csv, curves.csv, runs.csv, summary.csv, study.json, summary.json, timing.csv.
-    Run again with the same --out to go on after an interruption, a failure or a change of the
-    file: what is finished is not done again. Exit code 1: some runs failed, all others are done.
+    After an interruption, a failure or a change of the file, run again with the same --out:
+    finished runs are kept. Exit code 1: some runs failed; all others are done.
 
     Args:
         file: Study file (TOML).
@@ -85,7 +85,7 @@ def _execute(
 
 @study_app.command("plan")
 def show_plan(file: StudyFileArgument, json: cli.JsonOption = False) -> None:
-    """Show the runs of a study and the plant samples that they take: nothing is run or written.
+    """Show the runs of a study and their plant samples; nothing is run or written.
 
     Args:
         file: Study file (TOML).
@@ -117,15 +117,15 @@ def report_study(
     columns: str | None = None,
     json: cli.JsonOption = False,
 ) -> None:
-    """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
+    """Write a study's report: report.html as one self-contained page, report.md and figures/.
 
-    Of an unfinished study the finished runs are reported. A stored study may be reported, too;
-    `cosim results draw` draws the figures of its single runs before.
+    An unfinished study is reported by its finished runs. For a stored study use
+    `cosim results draw` first: it draws the figures of single runs.
 
     Args:
         folder: Folder of a study.
-        columns: Columns of the printed tables, by comma, or `all`: case, rank, samples, finished,
-            regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against,
+        columns: Columns of the printed tables, comma-separated, or `all`: case, rank, samples,
+            finished, regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against,
             difference, p; default: case,rank,regret,worst,finished.
     """
     with cli.output(json) as out_:
@@ -182,9 +182,9 @@ def reproduce(
 ) -> None:
     """Train the paper's rule and ours, and compare with (a) naive, (b) tuned and the optimum.
 
-    A study (results/reproduce.toml, results/reproduce-full.toml): writes report.html and report.md
-    with the paper's comparison at each reading of its open points and the paper's figure, and the
-    tables of `cosim study run`. Run again with the same --out to go on after an interruption.
+    Runs the study results/reproduce.toml, or with --budget full results/reproduce-full.toml. The
+    report has the paper's comparison at each reading of its open points, and the paper's figure.
+    After an interruption run again with the same --out.
 
     Args:
         budget: quick: minutes on 2 cores; full: hours, with more seeds and samples.
@@ -218,8 +218,8 @@ def check_results(
 ) -> None:
     """Run the studies again that say `check = true`, and compare with the stored tables.
 
-    Exit code 1 where a signal differs by more than its tolerance, with the first row that differs;
-    2 where a stored table is missing or damaged. Writes nothing.
+    Exit code 1: a column differs by more than its tolerance; the first such row is printed. Exit
+    code 2: a stored table is missing or damaged. Nothing is written.
 
     Args:
         folder: Folder with the studies and tolerances.toml; default: ./results, else the installed
@@ -275,7 +275,7 @@ def update_results(
 ) -> None:
     """Run studies and store their tables and reports, and the folder's README.
 
-    What long studies have finished is kept in the folder's `.work`; run again to go on.
+    Finished runs of long studies are kept in the folder's `.work`: run again to continue.
 
     Args:
         folder: Folder with the studies and tolerances.toml.
@@ -305,7 +305,7 @@ def draw_results(
 ) -> None:
     """Draw the figures of stored studies from their tables, as NAME/figures/*.svg.
 
-    Figures are not stored. `make docs` draws all of them for the site, some minutes.
+    Figures are not stored. `make docs` draws all of them for the site, in some minutes.
 
     Args:
         folder: Folder with the studies and tolerances.toml.

@@ -48,17 +48,17 @@ def train(
 ) -> None:
     """Train a controller's θ; write parameters.toml, learning.csv, learning.png, summary.json.
 
-    The learned θ is compared with the start on the same held-out noise. Exit code 1: it is worse,
-    and parameters.toml holds the start; or learning diverged, and the summary says why.
+    The learned θ is compared with its start on the same held-out noise. Exit code 1: θ is worse and
+    parameters.toml holds the start, or learning diverged; the summary has the reason.
 
-    With --data θ is learned from logged data, and no plant is stepped: the answer is the predicted
-    difference of J, with its interval, and θ is the start where the log cannot tell.
+    With --data the rule learns from logged data and steps no plant. The answer is the predicted
+    difference of J with its interval. If the log cannot tell, parameters.toml holds the start.
 
     Args:
-        algorithm: A registered one or module:Class.
+        algorithm: Name of a rule, or module:Class.
         samples: Plant samples; default: the algorithm's, or 50 000.
-        resume: Go on from the folder's checkpoint.
-        overwrite: Begin anew where the folder holds another run.
+        resume: Continue from the folder's checkpoint.
+        overwrite: Start again if the folder holds another run.
         assignments: Hyperparameter as NAME=VALUE; may be repeated.
         explain: List the algorithm's hyperparameters and stop.
         gif: Draw learning.gif too: the loop while θ is learned.

@@ -13,11 +13,11 @@ def view(
     at: float | None = None,
     json: JsonOption = False,
 ) -> None:
-    """Open a recording in the Rerun viewer, draw it to a PNG, or (--json) print what it holds.
+    """Open a recording in the Rerun viewer, draw it as a PNG, or list its content (--json).
 
     Args:
         file: Recording (.rrd).
-        png: Draw it to a PNG instead; needs no screen.
+        png: Draw it as a PNG instead, without a screen.
         at: Cursor of the PNG: time in s (training: sample); default: the worst violation of a run,
             or the end.
     """

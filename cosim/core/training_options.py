@@ -54,16 +54,16 @@ class TrainingOptions:
 
     Attributes:
         seed: Seed of noise and exploration.
-        start: Where θ starts: naive, tuned, backed-off, cautious or a parameters file.
-        controller: What carries θ: rti or converged.
-        log_every: Samples per row of the log; default: 1000, or what fits the next.
+        start: Start of θ: naive, tuned, backed-off, cautious or a parameters file.
+        controller: Solver of the NMPC: rti (one QP per sample) or converged.
+        log_every: Samples per row of the log; default: 1000, or fewer to fit the other intervals.
         evaluate_every: Samples per greedy evaluation; default: about 5000.
         checkpoint_every: Samples per checkpoint; default: about 5000.
         evaluation_seeds: Held-out runs per evaluation; 0: none.
-        evaluation_steps: Samples of each of them; default: 500, and on an FMU of your own what
-            keeps all of them within a tenth of the training's samples, or none.
-        divergence: Times the start's J at which a run has diverged.
-        rest_after: Samples after which θ stays and nothing explores; default: never.
+        evaluation_steps: Samples of each held-out run; default: 500. On an FMU of your own all
+            runs together take at most a tenth of the training's samples.
+        divergence: Factor of the start's J above which a run ends as diverged.
+        rest_after: Samples after which learning and exploration stop; default: never.
     """
 
     seed: int = _within(0, HELD_OUT - 1, 0)

@@ -389,7 +389,7 @@ def convexify(
         constraint = "constraint" if n_c == 1 else "constraints"
         raise TuningError(
             f"no convex cost has the local optimum of the economic one with {n_c} active "
-            f"{constraint} (Clarabel: {status}): staying at the steady state is not optimal"
+            f"{constraint} (Clarabel: {status}): the steady state is not optimal"
         )
 
     # Over α, so that H itself has the weight 1.

@@ -219,8 +219,8 @@ class ExtendedKalmanFilter:
         # A library that differs from the interpreter is refused: it would give wrong numbers fast.
         if not self._agrees_with(engine):
             warn(
-                "the C compiler makes other numbers of the model than CasADi does: the estimator "
-                "is not compiled, which is slower; set CC to another compiler",
+                "the compiled model and CasADi's give different numbers: the estimator is not "
+                "compiled, which is slower; set CC to another compiler",
                 ModelWarning,
             )
             return
@@ -529,9 +529,9 @@ class ExtendedKalmanFilter:
                 if abs(part) > UNSEEN:
                     parts.append(f"{part:+.3g} {name}")
             raise ControllerError(
-                f"the sensors do not show the direction {' '.join(parts)} of the state of model "
-                f"'{problem.model.name}', which does not decay by itself: no estimator can know "
-                "it; add a [[sensor]] that depends on it"
+                f"model '{problem.model.name}': the sensors do not show the direction "
+                f"{' '.join(parts)} of the state, and it does not decay: no estimator can know it; "
+                "add a [[sensor]] that depends on it"
             )
 
 

@@ -135,7 +135,7 @@ def pairing(gains: Array) -> NDArray[np.intp]:
     if not (chosen > 0.0).all():
         n_states, n_actions = gains.shape
         raise ControllerError(
-            f"{n_states} states and {n_actions} actions make no PI loops: they are one "
-            "state's to each action, and the gains of a sample must allow to pair them"
+            f"{n_states} states and {n_actions} actions make no PI loops: each action needs a "
+            "state of its own, and the gains of a sample must allow to pair them"
         )
     return np.asarray(states)

@@ -408,8 +408,8 @@ class Model:
             if magnitude is None and quantity.unit in TEMPERATURES:
                 raise ModelError(
                     f"model '{self.name}': the disturbance {quantity.name} is a temperature in "
-                    f"{quantity.unit}, whose nominal value says nothing of its size; add "
-                    "magnitude=… to its Quantity, ten times the deviation that you expect"
+                    f"{quantity.unit}, and its size does not follow from the nominal value; add "
+                    "magnitude=… to its Quantity, ten times the expected deviation"
                 )
             if magnitude is None:
                 magnitude = abs(quantity.nominal)

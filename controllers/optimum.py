@@ -237,7 +237,7 @@ def read_solution(
     except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
         raise OptimumError(
             f"{path}: not a readable optimal policy ({error}); delete it to have the policy "
-            "computed anew"
+            "computed again"
         ) from error
 
 

@@ -966,7 +966,7 @@ def check_integration(problem: Problem) -> Integration:
     if integration.unstable:
         raise ModelError(
             f"model '{model.name}' is too stiff for substeps = {problem.substeps}: at the "
-            "reference a mode that decays grows in the prediction of a sample of "
+            "reference the prediction of a stable mode grows in a sample of "
             f"{problem.sampling_time:g} s; {integration.remedy}"
         )
     if integration.coarse:

@@ -975,9 +975,9 @@ def _require_whole_state(scenario: Scenario, filtered: Mapping[str, float]) -> N
     plant = scenario.plant
     if len(filtered) > 1:
         raise OptimumError(
-            f"the optimum is computed for one disturbance with a memory: {', '.join(filtered)} "
-            "have one, by disturbance.time_constant, and so many states are too many for a grid; "
-            "compare with the best θ of a search on the plant"
+            "the optimum is computed for one disturbance with a memory, and "
+            f"{', '.join(filtered)} have one by disturbance.time_constant; compare with the best θ "
+            "of a search on the plant"
         )
     # Whoever names the plant's own model says that its states are all that matter.
     if plant.model is not None:
@@ -988,9 +988,9 @@ def _require_whole_state(scenario: Scenario, filtered: Mapping[str, float]) -> N
     hidden = [name for name in continuous_states(fmu) if name not in named]
     if hidden:
         raise OptimumError(
-            f"the optimum needs the plant's whole state: FMU '{fmu.name}' has the states "
-            f"{', '.join(hidden)}, too, which plant.states does not name, so there is no J* of "
-            "this scenario; compare with the best θ of a search on the plant"
+            f"there is no J* of this scenario: FMU '{fmu.name}' has the states "
+            f"{', '.join(hidden)}, and plant.states does not name them; compare with the best θ of "
+            "a search on the plant"
         )
 
 

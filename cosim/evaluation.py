@@ -97,7 +97,7 @@ def evaluate(
     """Run every controller on every seed; the table is the same for any number of workers.
 
     On a seed all controllers meet the same disturbances (common random numbers). A stored optimum
-    runs too, for J*, without rows of its own unless it is named. Every figure is computed anew.
+    runs too, for J*, without rows of its own unless it is named. Every run is computed again.
 
     Args:
         scenario: a scenario, a preset's name or a TOML file.
@@ -766,7 +766,7 @@ def _check_seeds_and_lengths(runs: Mapping[Path, tuple[int, _Recorded, int]]) ->
         if steps != first_steps:
             raise EvaluationError(
                 f"'{path}' has {steps} samples, '{first}' {first_steps}: runs that are "
-                "averaged must have the same length; cut them, or judge them in two folders"
+                "averaged must have the same length; cut them, or evaluate two folders"
             )
 
 

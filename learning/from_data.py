@@ -295,9 +295,9 @@ def _check_run(run: TrainingRun) -> None:
     for kind, tables in (("sensors", run.scenario.sensors), ("signals", run.scenario.signals)):
         if tables:
             raise ConfigurationError(
-                f"scenario '{run.scenario.name}' has {kind}, and a log is used only where the "
-                "states themselves are logged and nothing moves with time but them: log the "
-                "states, or train without --data, in operation; `cosim shadow` takes such a log"
+                f"scenario '{run.scenario.name}' has {kind}: learning from a log needs the "
+                "states themselves, and neither sensors nor signals; train without --data, in "
+                "operation; `cosim shadow` takes such a log"
             )
 
 

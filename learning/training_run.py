@@ -326,9 +326,9 @@ def begin_training(
         algorithm = getattr(algorithm, "under_sensors", algorithm)
     if run.scenario.signals and not getattr(algorithm, "learns_under_signals", False):
         raise ConfigurationError(
-            f"scenario '{run.scenario.name}' has signals, which {run.algorithm} cannot learn with "
-            "yet: use q-learning, model-based or fixed, or train on the same scenario without "
-            "[[signal]] and simulate or evaluate the θ on this one"
+            f"scenario '{run.scenario.name}' has signals, and {run.algorithm} cannot learn under "
+            "signals: use q-learning, model-based or fixed; or train on the scenario without "
+            "[[signal]] and evaluate θ on this one"
         )
     # Each source of randomness has its own stream, so that settings keep runs paired.
     start = run.starting_parameters()

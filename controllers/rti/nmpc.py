@@ -850,7 +850,7 @@ class RtiNmpc:
         engine = Engine.compile(self._functions)
         if engine is not None and not engine.agrees(self._functions):
             warn(
-                "the C compiler makes other numbers of the model than CasADi does: the controller "
+                "the compiled model and CasADi's give different numbers: the controller "
                 "is not compiled, which is slower; set CC to another compiler",
                 ModelWarning,
             )

@@ -107,7 +107,7 @@ def train(
         if there and not (resume or overwrite):
             raise CosimError(
                 f"folder '{folder}' holds another training ({there[0]}); go on with it by "
-                "--resume, begin anew by --overwrite, or choose another --out"
+                "--resume, start again by --overwrite, or choose another --out"
             )
         out_.announce(run.scenario.plant.fmu)
         checkpoint = folder / CHECKPOINT

@@ -133,8 +133,8 @@ class Signals:
             # To the bit: it is the same FMU with the same seed.
             if not np.array_equal(foreseen, realised):
                 raise PlantError(
-                    f"signal '{table.name}': disturbance '{table.measures}' is another one under "
-                    "other actions, so that nobody can forecast it: take the signal out"
+                    f"signal '{table.name}': disturbance '{table.measures}' depends on the actions "
+                    "and cannot be forecast: take the signal out"
                 )
 
     def _lasts_to(self, i: int, k: int) -> bool:

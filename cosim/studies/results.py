@@ -262,5 +262,5 @@ def study(
         name, failure = next(iter(runner.failures.items()))
         more = len(runner.failures) - 1
         others = f" ({more} more failed)" if more else ""
-        raise FailedRunsError(f"{name}: {failure.message}{others}; run again to try anew")
+        raise FailedRunsError(f"{name}: {failure.message}{others}; run the command again")
     return results

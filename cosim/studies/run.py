@@ -425,12 +425,12 @@ class RunStore:
             return True
         if before != facts:
             names = ", ".join(changed(before, facts))
-            self.remarks.append(f"{names} changed since these runs; they are done anew")
+            self.remarks.append(f"{names} changed since these runs; they are done again")
             return True
         unknown = [name for name, value in facts.items() if value == UNKNOWN]
         if unknown:
             names = ", ".join(unknown)
-            self.remarks.append(f"the code of {names} cannot be known: {self.run} is done anew")
+            self.remarks.append(f"the code of {names} cannot be known: {self.run} is done again")
             return True
         return False
 
@@ -441,7 +441,7 @@ class RunStore:
             path = self.folder / name
             if file_hash(path) == digest:
                 continue
-            self.remarks.append(f"'{path}' is not as it was written; made anew")
+            self.remarks.append(f"'{path}' is not as it was written; made again")
             # Without its training no evaluation of the run holds.
             if name in TRAINED:
                 return {}
@@ -467,7 +467,7 @@ class RunStore:
             about["files"] = dict(about.get("files", {}))
             about["facts"] = dict(about["facts"])
         except (StudyError, KeyError, TypeError, ValueError):
-            self.remarks.append(f"'{path}' is damaged; the run is done anew")
+            self.remarks.append(f"'{path}' is damaged; the run is done again")
             return {}
         return about
 
@@ -505,7 +505,7 @@ class RunStore:
         try:
             rows = read_table(path, columns, NOISE_KEY)
         except StudyError:
-            self.remarks.append(f"'{path}' is damaged; made anew")
+            self.remarks.append(f"'{path}' is damaged; made again")
             return {}
         # Rows of an earlier study in this folder may be of runs of another length.
         noise = self._noise(file)

@@ -176,7 +176,7 @@ def test_theta_that_is_replaced_during_a_study_is_the_one_that_was_planned(tmp_p
     disturbed = run_study({"controller": "theta.toml"}, "out", Replacing())
     lines = []
     with_second = run_study({"controller": "theta.toml"}, "out", lines)
-    assert "theta.toml changed since these runs; they are done anew" in lines
+    assert "theta.toml changed since these runs; they are done again" in lines
     first.save("theta.toml")
     undisturbed = run_study({"controller": "theta.toml"}, "other", [])
     assert disturbed == undisturbed != with_second

@@ -34,7 +34,7 @@ def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):
     code, out, err = cosim("optimum", "--scenario", "paper")
     assert (code, out) == (2, "")
     assert "not a readable optimal policy" in err
-    assert "delete it to have the policy computed anew" in err
+    assert "delete it to have the policy computed again" in err
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,7 @@ def test_a_disturbance_that_follows_the_actions_cannot_be_forecast():
     signals = Signals(scenario)
     signals.foresee(Following(), 1, 20)
     signals.check_foreseen(np.tile(np.resize(scenario.reference_action, 4), (20, 1)))
-    with pytest.raises(PlantError, match="nobody can forecast it"):
+    with pytest.raises(PlantError, match="cannot be forecast"):
         signals.check_foreseen(np.ones((20, 4)))
 
 

@@ -97,7 +97,7 @@ def test_a_changed_setting_is_named_and_trained_anew(tmp_path):
     first = one(1.0)
     lines.clear()
     assert one(3.0) != first
-    assert "training changed since these runs; they are done anew" in lines
+    assert "training changed since these runs; they are done again" in lines
 
 
 def test_burn_in_is_run_and_not_counted(tmp_path):

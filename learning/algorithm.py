@@ -101,9 +101,9 @@ class Update(NamedTuple):
 class Algorithm:
     """A learning rule. Register its class in the entry-point group `cosim.algorithms`.
 
-    The loop constructs it with a controller whose `theta` it may set, calls `observe` once per
-    sample, and solves for the policy anew after an `Update`. A class that has all this need not
-    inherit it.
+    The loop constructs it with a controller whose `theta` it may set, and calls `observe` once per
+    sample. After an `Update` the loop solves for the policy again. A class that has all this need
+    not inherit it.
 
     Attributes of the class:
 

@@ -572,8 +572,8 @@ def _known_parameters(
 def excitation(data: LoggedData, scenario: Scenario) -> dict[str, float]:
     """Part of each action's movement that the states do not explain, as a share of its range.
 
-    A controller that adds nothing of its own repeats what the states say, so that its log tells the
-    actions' effect from the disturbances' by the model alone.
+    The actions of a controller that adds no excitation follow from the states. Its log then tells
+    the actions' effect from the disturbances' by the model alone.
 
     Args:
         data: the transitions.

@@ -49,7 +49,7 @@ class Identified(Algorithm):
     """p̂ = argmin Σ ‖(s₊ − f(s, a; p))/σ‖², the prediction-error method, carried in θ's block p.
 
     σ is the standard deviation of the errors at the start's parameters. Then the cost is tuned at
-    the fitted model's optimal steady state, and the bounds are backed off by the largest of the
+    the fitted model's optimal steady state. The bounds are backed off by the largest of the
     fitted model's errors. This is done every shift.
     """
 

@@ -1,7 +1,7 @@
 """Selection of a log's samples for learning, and refusal of unfit logs.
 
-Only the nominal model is asked. It says whether the log's columns, rows and units are those of its
-plant, which readings no plant has, and since when the plant is the present one.
+Only the nominal model is asked. By its errors wrong columns, rows and units are found, impossible
+readings, and the last change of the plant.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The model's errors are played back in their order, so that under the logged actions it repeats the
 log, and two controllers meet the same. This is done for draws from the posterior of the model's
-coefficients, so that the intervals hold what the log does not say of the plant, beside the chance
-of its disturbances.
+coefficients. The intervals so hold the doubt about the plant, beside the chance of its
+disturbances.
 """
 
 from __future__ import annotations

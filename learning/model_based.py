@@ -566,9 +566,9 @@ class ExpectedCosts:
 class BackOffOnModel:
     """Searches back-offs δ (2n,) of the lower, then the upper state bounds on an empirical model.
 
-    Rollouts begin at the last of the visited states, and are lost where they cost more on average
-    than the most expensive of the visited samples, or their mean state is far from that of these
-    samples: the model has gone where the plant has not been. All θ meet the same noise until the
+    Rollouts begin at the last of the visited states. One fails if it costs more on average than the
+    most expensive of the visited samples, or if its mean state is far from theirs: the plant has
+    not been there. All θ meet the same noise until the
     next `draw`. δ are multiples of a twentieth of the error's order of magnitude, so that no last
     digit decides.
 
@@ -755,9 +755,9 @@ class BackOffOnModel:
     ) -> Array:
         """The smallest δ whose cost the model cannot tell from the least one.
 
-        First a grid at once over the active bounds, those whose penalty shows anywhere, up to two,
-        and one by one over what others there are. Then sweeps over each about the best point, on
-        longer rollouts. Bounds whose penalty shows nowhere have a reserve back-off.
+        First a grid over up to two active bounds at once, those whose penalty shows anywhere, and
+        over further ones one by one. Then sweeps over each about the best point, on longer
+        rollouts. Bounds whose penalty shows nowhere have a reserve back-off.
 
         Args:
             delta: present δ, (2n,).

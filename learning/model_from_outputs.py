@@ -1,8 +1,8 @@
 """`model-based` under sensors: filter, model and back-offs from readings that have gaps.
 
-At each update the variances of the estimator's noises are those that fit the plant's innovations
-best (`learning.innovations`), and the model's uncertain parameters what the filter then says. Both
-make a plant: the controller's model at these parameters, with disturbances of these variances,
+At each update the variances of the estimator's noises are fitted to the plant's innovations
+(`learning.innovations`). The uncertain parameters are the filter's estimates at these variances.
+Both make a plant: the controller's model at these parameters, with disturbances of these variances,
 behind the same sensors. On that plant, behind the same filter, back-offs are searched. A sample of
 it costs its stage cost at the estimate and the expectation of the next state's penalty.
 """

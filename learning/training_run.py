@@ -70,8 +70,8 @@ SHORTEST = 10
 class TrainingRun(TrainingOptions):
     """The identity of a training run; only an identical one can resume a checkpoint.
 
-    A run has diverged, and ends, where its greedy J exceeds the larger of the naive θ's and the
-    start's by more than (divergence − 1) of its magnitude, twice in a row or at the end.
+    A run ends as diverged if its greedy J exceeds the larger of the naive θ's and the start's by
+    more than (divergence − 1) of its magnitude. It must do so twice in a row, or at the end.
 
     Attributes:
         algorithm: name of a registered one, or `module:Class`.

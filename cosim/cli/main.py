@@ -223,8 +223,8 @@ def options(
 def main() -> None:
     """Run the command line.
 
-    Bad input ends in one line on standard error and exit code 2, an unforeseen error in one line, a
-    report with the traceback and exit code 70.
+    Bad input ends in one line on standard error and exit code 2. An unforeseen error ends in one
+    line, a report with the traceback and exit code 70.
     """
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to small
     # matrices.

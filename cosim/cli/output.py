@@ -104,9 +104,9 @@ class Output:
     ) -> None:
         """Print a table, columns of numbers right justified and the others left.
 
-        Where it is wider than the terminal, or than 80 characters in a file or pipe (`COLUMNS`
-        says another number), wide texts are folded, and columns that do not fit go to further
-        tables below, each with the first column.
+        It is as wide as the terminal, or 80 characters in a file or pipe; `COLUMNS` changes that.
+        Wide texts are folded. Columns that do not fit go to further tables below, each with the
+        first column.
 
         Args:
             title: a line above it.

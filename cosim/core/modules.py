@@ -67,8 +67,8 @@ def import_folders() -> tuple[str, ...]:
 def importing() -> Iterator[None]:
     """Let import statements find modules of `import_folders`, after all others.
 
-    No bytecode is written meanwhile: Python takes it for current where the source has the same
-    size and was changed in the same second, and would run the code from before an edit.
+    No bytecode is written meanwhile. Python compares sizes and whole seconds only: after a quick
+    edit it would run the old code.
     """
     with _import_lock:
         written = sys.dont_write_bytecode
@@ -171,9 +171,9 @@ def _is_ours(module: str) -> bool:
 def code_of(module: str) -> str | None:
     """The code of a loaded module in words that are equal where the code is.
 
-    They hold the distribution with its version, where the module is installed, and a hash of the
-    Python files of its package, or of its folder and the packages in it, as they were when this
-    process loaded the module. Files elsewhere, and data, are not part of it.
+    They hold the distribution with its version, if the module is installed, and a hash of Python
+    files. These are the files of its package, or of its folder and the packages in it, as this
+    process loaded them. Files elsewhere, and data, are not part of it.
 
     Args:
         module: full name of the module.

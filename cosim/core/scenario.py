@@ -954,8 +954,8 @@ def random_coloured_plant(seed: int) -> dict[str, Any]:
     """The changes of `paper` that make the plant of `random_plant` with time constants.
 
     Each disturbance has one with probability 3/4, log-uniform from 1 to 20 minutes, rounded to four
-    digits. They are drawn from a stream of their own, so that all else is that of `random-SEED`,
-    but for the standard deviations, which are 0.8 times as large.
+    digits. They are drawn from a stream of their own: all else is that of `random-SEED`. Only
+    the standard deviations are 0.8 times as large.
     """
     rng = np.random.default_rng([seed, 1])
     plant = random_plant(seed)

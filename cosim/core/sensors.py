@@ -25,7 +25,7 @@ class Sensors:
     A sensor takes a reading at the samples 0, `every`, 2·`every`, …: its variable's value then,
     plus normal noise. The reading arrives `delay` samples later; at samples where none arrives
     there is NaN. The noise of sensor i at sample k is a function of (seed, i, k) alone, as the
-    FMU's disturbances are, so that every controller meets the same.
+    FMU's disturbances are. Every controller meets the same.
 
     Args:
         tables: the sensors, n_y of them.

@@ -338,8 +338,8 @@ def _obstacle(description: Any) -> str:
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
-    It lies in a `cosim.core.files.cache_folder`, whose path has no escapes in its URI, since many
-    FMUs do not read those in the URI of their resources.
+    It lies in a `cosim.core.files.cache_folder`. The URI of that path has no escapes: many FMUs do
+    not read them in the URI of their resources.
 
     Args:
         archive: the FMU.

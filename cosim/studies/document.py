@@ -70,7 +70,7 @@ class CurvesTable(Table):
 class OperationTable(Table):
     """Learning in operation: every training runs from one plant sample to the next, without reset.
 
-    Its θ is evaluated, greedily, at the given times, each on the plant as it is then, on the noise
+    Its θ is evaluated greedily at the given times, on the plant as it is then. The noise is that
     of `[evaluation]`, or of `[curves]` where the file has that table. Algorithms require
     `operation`; the last time is the length of every run.
     """

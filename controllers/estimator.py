@@ -595,6 +595,8 @@ class OutputFeedback:
         self._known: Mapping[str, Vector] | None = None
         self._is_predicted = True
         self._is_corrected = False
+        # Why the controller's preparation has failed; None where it has not.
+        self._failure: Exception | None = None
 
     @classmethod
     def from_scenario(cls, scenario: Scenario, controller: Controller) -> OutputFeedback:
@@ -666,6 +668,7 @@ class OutputFeedback:
         self._known = None
         self._is_predicted = True
         self._is_corrected = False
+        self._failure = None
 
     def state_dict(self) -> dict[str, Vector]:
         """Memory of the estimator after a `feedback`; the controller keeps its own."""
@@ -679,6 +682,7 @@ class OutputFeedback:
     def resume(self) -> None:
         """Reset the controller and keep the estimate: what follows a failed solve."""
         self.controller.reset()
+        self._failure = None
 
     def inform(self, known: Mapping[str, Vector]) -> None:
         """Take up what is known of the scenario's signals at the sample to come.
@@ -691,7 +695,11 @@ class OutputFeedback:
             self.controller.inform(known)
 
     def prepare(self) -> None:
-        """Predict the state, and do the controller's work that needs no measurement."""
+        """Predict the state, and do the controller's work that needs no measurement.
+
+        Where that fails to make a QP, `feedback` says so, once it has taken up the readings: they
+        come only once, and the next sample's estimate needs them.
+        """
         if self._noise_place is not None:
             self._set_noise()
         if not self._is_predicted and self._last_action is not None:
@@ -701,7 +709,20 @@ class OutputFeedback:
             self.estimator.inform(self._known)
         self._is_predicted = True
         self._is_corrected = False
-        self.controller.prepare()
+        self._failure = None
+        try:
+            self.controller.prepare()
+        except Exception as error:
+            if not getattr(type(error), "is_solver_failure", False):
+                raise
+            self._failure = error
+
+    @property
+    def linearisation_point(self) -> Any:
+        """The controller's; None where its preparation has failed."""
+        if self._failure is not None:
+            return None
+        return self.controller.linearisation_point  # type: ignore[attr-defined]
 
     def feedback(self, y: ArrayLike, a: Vector | None = None) -> Solution:
         """Correct the estimate by the sample's readings, and solve for it.
@@ -710,12 +731,17 @@ class OutputFeedback:
             y: Readings, (n_y,), NaN where nothing new came. A second call in a sample, with `a`,
                 leaves the estimate as it is.
             a: Action to which the first one is fixed, (m,); without it the controller chooses.
+
+        Raises:
+            Exception: The controller's, of its preparation too; the readings are then taken up.
         """
         if self._is_corrected:
             estimate = self.estimator.estimate
         else:
             estimate = self.estimator.correct(np.asarray(y, dtype=np.float64))
             self._is_corrected = True
+        if self._failure is not None:
+            raise self._failure
         solution = self.controller.feedback(estimate, a)
         if self._noise_place is not None:
             solution = self._differentiated(solution)

@@ -262,9 +262,10 @@ class TrainingLoop:
 
     def renew(self) -> None:
         """Solve again for the present state at the same linearisation point, after θ has moved."""
-        if self._loop.point is not None:
-            self.controller.prepare_at(self._loop.point)
-            self._solve(prepare=False)
+        point = self._loop.point
+        if point is not None:
+            # Where the new θ has no finite QP there, that is a failed solve.
+            self._solve(lambda: self.controller.prepare_at(point))
 
     def next(self) -> tuple[Transition | None, float]:
         """One sample of the plant.
@@ -369,12 +370,16 @@ class TrainingLoop:
             )
         return self._simulator
 
-    def _solve(self, *, prepare: bool = True) -> None:
-        """Solve for V(s) and π(s) of the present state; a failure is counted."""
+    def _solve(self, prepare: Callable[[], None] | None = None) -> None:
+        """Solve for V(s) and π(s) of the present state; a failure is counted.
+
+        Args:
+            prepare: as in `ClosedLoop.solve`.
+        """
         if self.signals is not None:
             self._known = self.signals.known(self._loop.number)
             self._signal_changes = self._signal_costs.of_sample(self._known)
-        self.counts.failures += not self._loop.solve(prepare=prepare)
+        self.counts.failures += not self._loop.solve(prepare)
 
     def restart(self) -> None:
         """Reset the controller but for its linearisation point.
@@ -386,9 +391,7 @@ class TrainingLoop:
         # A failed sample has left no linearisation point.
         if self._loop.point is None:
             # Not by the law, whose estimator has predicted this sample already.
-            self.controller.prepare()
-            self._loop.point = self.controller.linearisation_point
-            self._solve(prepare=False)
+            self._solve(self.controller.prepare)
         else:
             self.renew()
 

@@ -340,11 +340,15 @@ class FittedPlant:
         estimator.load_state_dict(self._state)
         step.inputs["p"][:] = self._p
         s = estimator.estimate
-        y = sensors.start(self._seed, self._measured(s))
+        readings = self._measured(s)
+        y = sensors.start(self._seed, readings)
         means = np.empty((n_samples, n))
         variances = np.empty((n_samples, n))
         costs = np.empty(n_samples)
         for k in range(n_samples):
+            # Else such readings would pass for none that are new, and the estimate for a state.
+            if not np.isfinite([*s, *readings]).all():
+                return _cost_of_a_failure(n)
             try:
                 law.prepare()
                 # The state of a sample is predicted before its readings are taken up.
@@ -365,7 +369,8 @@ class FittedPlant:
             step.inputs["d"][:] = nominal + self._deviations * draws
             step()
             s = step.part("x").copy()
-            y = sensors.read(k + 1, self._measured(s))
+            readings = self._measured(s)
+            y = sensors.read(k + 1, readings)
         penalties = expected_penalties_with_errors(
             self._scenario.state_penalty,
             means[burn_in:],

@@ -83,9 +83,9 @@ class ClosedLoop:
     A sample is `prepare`, then `feedback(s)`, then the plant steps under the action, saturated to
     the actuators' bounds. Where the plant has sensors the controller is given y in place of s.
     Where the scenario has signals it is told before `prepare` what is known of them then. A
-    failed solve is an exception whose class has `is_solver_failure`: the last applied action (first
-    the reference action) is then applied once more, and the controller is reset. Every other error
-    is raised.
+    failed solve is an exception, of either phase, whose class has `is_solver_failure`: the last
+    applied action (first the reference action) is then applied once more, and the controller is
+    reset. Every other error is raised.
 
     Args:
         step: the plant, from an action (m,) to what its next sample gave.
@@ -176,11 +176,11 @@ class ClosedLoop:
         if self._known is not None and self._inform is not None:
             self._inform(self._known(self.number))
 
-    def solve(self, *, prepare: bool = True) -> bool:
+    def solve(self, prepare: Callable[[], None] | None = None) -> bool:
         """Prepare, and feed the present state back, into `solution`.
 
         Args:
-            prepare: whether to prepare; else the controller's own preparation is used.
+            prepare: prepares the controller; None: its own `prepare`, told what is known.
 
         Returns:
             Whether there is a solution.
@@ -191,13 +191,15 @@ class ClosedLoop:
         begin = middle = perf_counter()
         # The two phases are timed apart: only feedback delays the action.
         try:
-            if prepare:
+            if prepare is None:
                 self.inform()
                 self._controller.prepare()
-                # Now: a feedback of several QPs linearises elsewhere.
-                if self._keeps_points:
-                    self.point = self._controller.linearisation_point  # type: ignore[attr-defined]
-                middle = perf_counter()
+            else:
+                prepare()
+            # Now: a feedback of several QPs linearises elsewhere.
+            if self._keeps_points:
+                self.point = self._controller.linearisation_point  # type: ignore[attr-defined]
+            middle = perf_counter()
             self.solution = self._controller.feedback(self.given)
             end = perf_counter()
             self._check_solution()

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controllers import ControllerError, ExtendedKalmanFilter, Model, OutputFeedback, Quantity
-from controllers.errors import ModelError
+from controllers.errors import ModelError, QpError
 from controllers.factories import build_controller
 from controllers.filter_model import INITIAL_DEVIATION
 from controllers.model import discretise
@@ -299,3 +299,36 @@ def test_the_estimator_is_told_what_was_applied():
         ("correct", 2.0),
         ("predict", 0.5, 0.5),
     ]
+
+
+class Unprepared(Half):
+    """Has no QP at its second sample, and says so when it prepares."""
+
+    preparations = 0
+
+    def prepare(self):
+        self.preparations += 1
+        if self.preparations == 2:
+            raise QpError("told to fail", status="QP not finite")
+
+
+def test_readings_are_taken_up_where_the_preparation_fails():
+    """As in C: they come only once, so that without them the next estimate would be worse."""
+    tables = [SensorTable(variable="a", deviation=0.1), SensorTable(variable="b", deviation=0.1)]
+    alone = ExtendedKalmanFilter(linear_problem(), tables)
+    law = OutputFeedback(ExtendedKalmanFilter(linear_problem(), tables), Unprepared())
+    readings = np.array([[1.0, 0.0], [2.0, -1.0], [0.5, 0.5]])
+    law.reset()
+    for k, y in enumerate(readings):
+        law.prepare()
+        if k == 1:
+            with pytest.raises(QpError, match="told to fail"):
+                law.feedback(y)
+            law.resume()
+        else:
+            law.feedback(y)
+        if k > 0:
+            alone.predict([0.25])
+        alone.correct(y)
+        assert np.array_equal(law.estimate, alone.estimate)
+        law.applied(np.array([0.25]))

@@ -99,6 +99,23 @@ def test_a_failure_repeats_the_action_and_teaches_nothing(plant, problem, parame
     assert loop.counts.failures == 1
 
 
+class Unprepared(RtiNmpc):
+    """Has no finite QP after θ has moved."""
+
+    def prepare_at(self, point):
+        raise QpError("told to fail", status="QP not finite")
+
+
+def test_a_theta_without_a_finite_qp_is_a_failed_solve(plant, problem, parameters):
+    loop, _ = interaction(
+        plant, problem, Unprepared(problem, parameters), exploration_probability=0.0
+    )
+    loop.next()
+    loop.renew()
+    assert loop.counts.failures == 1
+    assert [loop.next()[0] is None for _ in range(3)] == [True, False, False]
+
+
 def make_run(scenario, seed=3):
     configuration = QLearning.Configuration.from_dict({"prior_samples": 20, "step_every": 20})
     return TrainingRun("q-learning", scenario, 100, configuration, seed=seed)

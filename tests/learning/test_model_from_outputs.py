@@ -1,5 +1,7 @@
 """Filter and back-offs from readings with gaps: the parts by theory, the rule on its preset."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -142,6 +144,56 @@ def test_a_back_off_that_went_too_far_comes_down_to_what_is_cheapest():
     best = search.best(start, np.zeros(4))
     assert best[0] == pytest.approx(5.0, abs=settings.back_off_step)
     assert np.array_equal(best[1:], reserve[1:])
+
+
+class RunsAway:
+    """Stands for a filter whose readings fit ever better, until it runs away with η > 0.5."""
+
+    sensitivities = SimpleNamespace(log_likelihood=np.array([100.0]))
+    standardised = np.zeros(1)
+
+    def __init__(self, noise):
+        self.noise = np.array([noise])
+
+    def reset(self):
+        pass
+
+    def correct(self, y):
+        pass
+
+    @property
+    def log_likelihood(self):
+        return 100.0 * self.noise[0] if self.noise[0] < 0.5 else np.nan
+
+
+@pytest.mark.parametrize("start", [-2.0, 0.4])
+def test_variances_with_which_the_filter_runs_away_are_not_the_result(start):
+    estimator = RunsAway(start)
+    noise, _ = fit_noise(estimator, np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1), 2.0, 15)
+    assert start <= noise[0] < 0.5
+    assert np.isfinite(estimator.log_likelihood)
+
+
+def test_where_the_filter_runs_away_from_the_start_the_prior_stands_in():
+    estimator = RunsAway(0.7)
+    noise, _ = fit_noise(estimator, np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1), 2.0, 15)
+    assert noise[0] == 0.0
+    assert np.isfinite(estimator.log_likelihood)
+
+
+@pytest.mark.parametrize("state", [[1e8, 50.0], [np.nan, 50.0]])
+def test_a_fitted_plant_that_runs_away_costs_more_than_any(state):
+    """From a state that leads to no finite QP, in its preparation or its feedback."""
+    scenario = Scenario.load("assay-fouled")
+    run = make_run("model-based", scenario, 60)
+    start = run.starting_parameters()
+    estimator = ExtendedKalmanFilter.from_scenario(scenario, differentiates=True)
+    memory = estimator.state_dict()
+    memory["states"][0, :2] = state
+    estimator.load_state_dict(memory)
+    plant = FittedPlant(scenario, start, run.configuration.normal_errors)
+    plant.fit(estimator, {"UA2": 6.84}, [np.empty(0), np.empty(0)], 1)
+    assert plant.run(start, 30, 10).mean == np.inf
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from controllers.problem import Problem, given_parameters
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.core.protocols import Vector
 from cosim.core.scenario import EstimatorTable, Scenario
+from cosim.core.sensors import require_readings
 from cosim.core.signals import period_of
 from cosim.core.simulation import spawn_seeds
 from cosim.core.training_options import (
@@ -357,6 +358,7 @@ def begin_training(
         algorithm_rng,
         _retreat(run, rule, controller.theta),
     )
+    require_readings(run.scenario, run.samples + 1)
     if loop.signals is not None:
         # The state after the last sample is solved for, too.
         loop.signals.require(run.samples + 1)

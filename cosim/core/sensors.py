@@ -8,15 +8,34 @@ from math import nan
 
 import numpy as np
 
-from cosim.core.errors import PlantError
+from cosim.core.errors import PlantError, ScenarioError
 from cosim.core.protocols import Array
-from cosim.core.scenario import SensorTable
+from cosim.core.scenario import Scenario, SensorTable
 
 DRAWS_AT_ONCE = 256
 """Draws of a sensor that are made at once."""
 _SEED = struct.Struct("<Q")
 STREAM = 0x53454E53
 """Word of the counter that keeps the sensors' draws apart from every other use of a seed."""
+
+
+def require_readings(scenario: Scenario, samples: int) -> None:
+    """Check that each sensor is read at least once in a run.
+
+    Args:
+        scenario: with sensors, or without.
+        samples: of the run.
+
+    Raises:
+        ScenarioError: the first reading of a sensor comes after the run.
+    """
+    for table in scenario.sensors or ():
+        if table.delay >= samples:
+            raise ScenarioError(
+                f"scenario '{scenario.name}': the sensor of '{table.variable}' is never read: its "
+                f"first reading comes after {table.delay} samples, and the run has {samples}; make "
+                "the run longer or the sensor's delay shorter"
+            )
 
 
 class Sensors:

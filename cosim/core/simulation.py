@@ -26,6 +26,7 @@ from cosim.core.protocols import (
     Solution,
     Step,
 )
+from cosim.core.sensors import require_readings
 from cosim.core.signals import Signals
 from cosim.core.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
 from cosim.core.validation import whole_number
@@ -359,10 +360,12 @@ def simulate(
 
     Raises:
         RunEndedError: the plant failed in mid run; its `trajectory` has the samples before.
-        ScenarioError: a signal of the scenario, or its preview, ends before the run.
+        ScenarioError: a signal of the scenario, or its preview, ends before the run; a sensor is
+            not read in it.
     """
     steps = whole_number("steps", steps, 1, CosimError)
     scenario = plant.scenario
+    require_readings(scenario, steps)
     signals = Signals(scenario) if scenario.signals else None
     if signals is not None:
         signals.require(steps)

@@ -130,6 +130,15 @@ def test_a_sensor_of_no_variable_is_refused():
         FmuPlant(with_sensors({"variable": "X9"}))
 
 
+def test_a_sensor_whose_first_reading_comes_after_the_run_is_refused():
+    scenario = with_sensors({"variable": "X2"}, {"variable": "P2", "delay": 30})
+    controller = build_controller("naive", scenario)
+    with FmuPlant(scenario) as plant:
+        with pytest.raises(ScenarioError, match=r"sensor of 'P2' is never read: .* 30 samples"):
+            simulate(plant, controller, 30, 0)
+        simulate(plant, controller, 31, 0)
+
+
 def test_a_controller_of_the_state_is_refused_where_there_are_sensors():
     controller = build_controller("naive", Scenario.load("paper"))
     with (

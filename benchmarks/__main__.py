@@ -12,6 +12,7 @@ STEPS = {
     "controllers": 2000,
     "learning": 1000,
     "estimator": 2000,
+    "preview": 2000,
     "export": 2000,
     "evaluation": 2000,
     "scaling": 20,

@@ -35,6 +35,9 @@ NOTHING_ADDED = 1e-7
 LINEAR = 1e-9
 """Curvature, as a share of that size, below which an economic cost counts as linear."""
 
+LEAST_SHARE = 1e-2
+"""Share of the convex cost's least curvature below which the economic cost's decides nothing."""
+
 
 @dataclass(frozen=True)
 class SteadyState:
@@ -603,22 +606,46 @@ def _scaled_cost(steady: SteadyState, ranges: Array) -> tuple[Array, float]:
     return H, size
 
 
+def _deviations(problem: Problem) -> Array:
+    """Deviations of (x, u) that weigh the same where the cost is made convex, (n+m,).
+
+    They are what the model states of its quantities, and the widths of the bounds where it states
+    none. Both change with the units, so that the tuned cost is the same in any.
+    """
+    deviations = Scale.from_problem(problem).ranges.copy()
+    model = problem.model
+    quantities = (*model.states, *model.actions)
+    for i, quantity in enumerate(quantities):
+        if quantity.deviation is not None:
+            deviations[i] = quantity.deviation
+    return deviations
+
+
 def _local_tuning(problem: Problem, steady: SteadyState) -> LocalTuning:
     """The tuning of the economic cost as it is; TuningError where no convex cost is its equal."""
-    A = steady.A
-    B = steady.B
     C = steady.C
     ranges = Scale.from_problem(problem).ranges
-    scaled_H, size = _scaled_cost(steady, ranges)
-    curvature = np.abs(scaled_H).max()
+    H_of_ranges, size = _scaled_cost(steady, ranges)
+    curvature = np.abs(H_of_ranges).max()
     if curvature < LINEAR * size:
         # αH is zero: nothing determines α, and the solver's rounding would be the cost's size.
         raise TuningError("the cost is linear, so that no curvature says how to come back to it")
+    # βI ⪰ H̃ ⪰ I compares variables with each other, which needs a size of each.
+    deviations = _deviations(problem)
+    A, B = _scaled_dynamics(steady, deviations)
+    H, _ = _scaled_cost(steady, deviations)
     # The economic cost's feedback is what the tuned one must equal: the certificate.
-    economic, _ = local_feedback(A, B, steady.hessian, C)
-    convex = convexify(A, B, steady.hessian, C)
+    economic, _ = local_feedback(A, B, H, C)
+    convex = convexify(A, B, H, C)
+    share = convex.alpha * np.abs(H).max()
+    if share < LEAST_SHARE:
+        # 𝓗(δP) + CᵀFC is convex without H: the best α is zero, and the solver's is its rounding.
+        raise TuningError(
+            "the steady state is a vertex: its active bounds alone say how to come back to it"
+        )
     tuned, P = local_feedback(A, B, convex.hessian, C)
-    return LocalTuning(convex, C, economic, tuned, P, None)
+    scaled = LocalTuning(convex, C, economic, tuned, P, None)
+    return _in_units_of_the_problem(scaled, deviations, cost=1.0)
 
 
 def _augmented_tuning(
@@ -631,12 +658,8 @@ def _augmented_tuning(
     All is computed in w_i / range_i: there one σ serves every variable, and a change of units
     changes nothing.
     """
-    n = problem.n_states
     ranges = Scale.from_problem(problem).ranges
-    x_range = ranges[:n]
-    u_range = ranges[n:]
-    A = steady.A * x_range / x_range[:, None]
-    B = steady.B * u_range / x_range[:, None]
+    A, B = _scaled_dynamics(steady, ranges)
     H, size = _scaled_cost(steady, ranges)
     # C's rows are unit vectors, of which a scaling changes the length alone.
     C, released = _keepable_constraints(A, B, steady, ranges)
@@ -650,30 +673,49 @@ def _augmented_tuning(
     # Half of the curvature leaves the conditioning some room.
     least = 0.5 * LEAST_CURVATURE * size
     in_units_of_least = augmented / least
-    scaled = convexify(A, B, in_units_of_least, C, alpha=1.0)
+    convex = convexify(A, B, in_units_of_least, C, alpha=1.0)
     economic, _ = local_feedback(A, B, in_units_of_least, C)
-    tuned, P = local_feedback(A, B, scaled.hessian, C)
+    tuned, P = local_feedback(A, B, convex.hessian, C)
+    addition = Addition(sigma, ranges, C, released, reason)
+    scaled = LocalTuning(convex, C, economic, tuned, P, addition)
+    return _in_units_of_the_problem(scaled, ranges, cost=least)
 
-    # Back into the units of the problem.
-    force_range = C @ ranges
-    w_scale = np.outer(ranges, ranges)
-    x_scale = np.outer(x_range, x_range)
-    force_scale = np.outer(force_range, force_range)
-    convex = Convexification(
-        hessian=least * scaled.hessian / w_scale,
-        delta_P=least * scaled.delta_P / x_scale,
-        F=least * scaled.F / force_scale,
-        alpha=scaled.alpha,
-        beta=scaled.beta,
+
+def _scaled_dynamics(steady: SteadyState, scale: Array) -> tuple[Array, Array]:
+    """A (n, n) and B (n, m) in w_i / scale_i."""
+    n = len(steady.x)
+    x_scale = scale[:n]
+    u_scale = scale[n:]
+    A = steady.A * x_scale / x_scale[:, None]
+    B = steady.B * u_scale / x_scale[:, None]
+    return A, B
+
+
+def _in_units_of_the_problem(
+    scaled: LocalTuning,
+    scale: Array,
+    cost: float,
+) -> LocalTuning:
+    """A tuning in w_i / `scale`_i, its costs counted in `cost`, in the problem's own units."""
+    n = len(scaled.value)
+    x_scale = scale[:n]
+    u_scale = scale[n:]
+    F_scale = scaled.constraints @ scale
+    convex = scaled.convexification
+    of_problem = Convexification(
+        hessian=cost * convex.hessian / np.outer(scale, scale),
+        delta_P=cost * convex.delta_P / np.outer(x_scale, x_scale),
+        F=cost * convex.F / np.outer(F_scale, F_scale),
+        alpha=convex.alpha,
+        beta=convex.beta,
     )
-    gain_scale = u_range[:, None] / x_range
-    return LocalTuning(
-        convexification=convex,
-        constraints=C,
-        economic=economic * gain_scale,
-        tuned=tuned * gain_scale,
-        value=least * P / x_scale,
-        addition=Addition(sigma, ranges, C, released, reason),
+    gain_scale = u_scale[:, None] / x_scale
+    return dataclasses.replace(
+        scaled,
+        convexification=of_problem,
+        economic=scaled.economic * gain_scale,
+        tuned=scaled.tuned * gain_scale,
+        value=cost * scaled.value / np.outer(x_scale, x_scale),
     )
 
 

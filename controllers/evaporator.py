@@ -9,13 +9,14 @@ import casadi as ca
 
 from controllers.model import Model, Quantity, by_name
 
+# In the economic tuning one unit of each weighs the same, as in the paper.
 STATES = (
-    Quantity("X2", "%", 25.0),
-    Quantity("P2", "kPa", 49.74297),
+    Quantity("X2", "%", 25.0, deviation=1.0),
+    Quantity("P2", "kPa", 49.74297, deviation=1.0),
 )
 ACTIONS = (
-    Quantity("P100", "kPa", 191.71322),
-    Quantity("F200", "kg/min", 215.88844),
+    Quantity("P100", "kPa", 191.71322, deviation=1.0),
+    Quantity("F200", "kg/min", 215.88844, deviation=1.0),
 )
 DISTURBANCES = (
     Quantity("X1", "%", 5.0),

@@ -78,12 +78,16 @@ class Quantity:
         magnitude: of a disturbance, the size of which its guessed deviation is 10 %; the nominal
             value's if not given. A temperature needs one: the zero of its unit says nothing of
             its size.
+        deviation: of a state or an action, the deviation that weighs as much as those of the
+            others, where the economic tuning makes the cost convex; the width of its bounds if
+            not given.
     """
 
     name: str
     unit: str
     nominal: float = 0.0
     magnitude: float | None = None
+    deviation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -375,12 +379,13 @@ class Model:
                     f"model '{self.name}': the nominal value of {quantity.name} must be a finite "
                     f"number, not {quantity.nominal!r}"
                 )
-            magnitude = quantity.magnitude
-            if magnitude is not None and not _is_positive(magnitude):
-                raise ModelError(
-                    f"model '{self.name}': the magnitude of {quantity.name} must be a positive "
-                    f"number, not {magnitude!r}"
-                )
+            for attribute in ("magnitude", "deviation"):
+                size = getattr(quantity, attribute)
+                if size is not None and not _is_positive(size):
+                    raise ModelError(
+                        f"model '{self.name}': the {attribute} of {quantity.name} must be a "
+                        f"positive number, not {size!r}"
+                    )
         return tuple(given)
 
     @property

@@ -68,13 +68,14 @@ def model() -> Model:
     """An exothermic reaction A → B in a stirred tank with a cooling jacket; time in minutes."""
     return Model(
         name="reactor",
+        # In the economic tuning one unit of each state and action weighs the same.
         states=(
-            Quantity("cA", "mol/L", 0.5),
-            Quantity("T", "K", 345.0),
+            Quantity("cA", "mol/L", 0.5, deviation=1.0),
+            Quantity("T", "K", 345.0, deviation=1.0),
         ),
         actions=(
-            Quantity("q", "L/min", 100.0),
-            Quantity("Tc", "K", 320.0),
+            Quantity("q", "L/min", 100.0, deviation=1.0),
+            Quantity("Tc", "K", 320.0, deviation=1.0),
         ),
         disturbances=(
             Quantity("cAf", "mol/L", 1.0),

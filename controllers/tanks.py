@@ -48,15 +48,16 @@ def model() -> Model:
     """Four tanks, two pumps, each of which feeds a lower and an upper tank; time in seconds."""
     return Model(
         name="tanks",
+        # In the economic tuning one unit of each state and action weighs the same.
         states=(
-            Quantity("h1", "cm", 10.0),
-            Quantity("h2", "cm", 10.0),
-            Quantity("h3", "cm", 10.0),
-            Quantity("h4", "cm", 10.0),
+            Quantity("h1", "cm", 10.0, deviation=1.0),
+            Quantity("h2", "cm", 10.0, deviation=1.0),
+            Quantity("h3", "cm", 10.0, deviation=1.0),
+            Quantity("h4", "cm", 10.0, deviation=1.0),
         ),
         actions=(
-            Quantity("v1", "V", 3.0),
-            Quantity("v2", "V", 3.0),
+            Quantity("v1", "V", 3.0, deviation=1.0),
+            Quantity("v2", "V", 3.0, deviation=1.0),
         ),
         disturbances=(
             Quantity("d1", "cm3/s", 3.0),

@@ -12,6 +12,17 @@ from controllers.problem import Problem
 from cosim.core.protocols import Step
 
 
+def _recounted(quantities, factors):
+    """Quantities with the deviations that they state counted otherwise."""
+    recounted = []
+    for quantity, factor in zip(quantities, factors, strict=True):
+        deviation = quantity.deviation
+        if deviation is not None:
+            deviation = factor * deviation
+        recounted.append(dataclasses.replace(quantity, deviation=deviation))
+    return tuple(recounted)
+
+
 @dataclass(frozen=True)
 class Counting:
     """value there = factor · value here + zero, of states, actions and disturbances; cost factor.
@@ -52,6 +63,8 @@ class Counting:
         factors = ca.DM(self.states[0])
         return dataclasses.replace(
             own,
+            states=_recounted(own.states, self.states[0]),
+            actions=_recounted(own.actions, self.actions[0]),
             disturbances=tuple(disturbances),
             ode=lambda x, u, d, p: factors * own.ode(*here(x, u, d), p),
             economic_cost=lambda x, u, d, p: self.cost * own.economic_cost(*here(x, u, d), p),
@@ -190,6 +203,14 @@ COUNTINGS = {
         disturbances=([10.0, 1.0], [0.0, 273.15]),
         cost=10.0,
     ),
+    # Pounds, °F and BTU/h: factors that are no powers of ten.
+    "dead-time in pounds": Counting(
+        factory="heater_model_in_pounds",
+        states=([2.2046, 1.8], [0.0, 32.0]),
+        actions=([2.2046, 3412.14], [0.0, 0.0]),
+        disturbances=([2.2046, 1.8], [0.0, 32.0]),
+        cost=0.7,
+    ),
     # mmol for mol, °C for K.
     "unstable-reactor": Counting(
         factory="unstable_reactor_model",
@@ -219,6 +240,11 @@ def tanks_model():
 def heater_model():
     """The heated tank's, counted otherwise."""
     return COUNTINGS["dead-time"].model(heater.model())
+
+
+def heater_model_in_pounds():
+    """The heated tank's, counted otherwise again."""
+    return COUNTINGS["dead-time in pounds"].model(heater.model())
 
 
 def unstable_reactor_model():

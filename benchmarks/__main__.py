@@ -17,7 +17,6 @@ STEPS = {
     "evaluation": 2000,
     "scaling": 20,
     "before": 2000,
-    "acados": 200,
     "rollouts": 100_000,
     "batches": 1000,
 }
@@ -30,14 +29,14 @@ def main():
     parser.add_argument("--scenario", "-s", default="paper")
     parser.add_argument("--steps", "--samples", "-n", type=int, help="samples at a time")
     parser.add_argument(
-        "--against", help="`before`: folder of another version's sources; `acados`: its Python"
+        "--against", help="`before`: folder of another version's sources, with its .venv"
     )
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     steps = STEPS[chosen.name] if chosen.steps is None else chosen.steps
     if steps < 1:
         parser.error(f"--steps must be at least 1, not {steps}")
-    compared = chosen.name in ("before", "acados")
+    compared = chosen.name == "before"
     if compared and not chosen.against:
         parser.error(f"{chosen.name} needs --against")
     scenario = Scenario.load(chosen.scenario)

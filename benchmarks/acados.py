@@ -1,203 +1,249 @@
-"""Our sample beside acados' real-time iteration on the same problem, turn by turn in one run.
+"""`python -m benchmarks.acados N_STATES,HORIZON …`: our sample beside acados' real-time iteration.
 
-acados comes from an environment of its own, which `--against` names by its Python:
+Tanks in series with two pumps, both solvers on the same states in one process, in turns. It prints
+a row of a table for each case: our time of a sample with all derivatives, its ratio to acados'
+by configuration for each of `PARTS`, and how far the results lie apart. Where they differ by more
+than `TOLERANCE` there is no row.
 
-    python3 -m venv acados
-    acados/bin/pip install comma-deps-acados platformdirs daqp tomli_w pydantic
-    python -m benchmarks acados --against acados/bin/python
+acados 0.6 and its Python package `acados_template` are built from their sources:
 
-That package has a CasADi of its own, and acados 0.2.2, whose solver differentiates its solution in
-the initial state alone: without dV/dθ and dπ/dθ it has less to do than ours. Its worker reads the
-problem from this checkout: the same model by the same Runge–Kutta steps, costs, bounds, penalties.
-Of acados only its own calls are timed, not what its Python interface needs to set and get; of ours
-all, shift and Python included. HPIPM is in its fast mode, which gives the actions to 1e-4.
+    cmake -DACADOS_WITH_DAQP=ON -DCMAKE_C_FLAGS="-O3 -march=native" -DACADOS_INSTALL_DIR=FOLDER …
+    make install
+    pip install FOLDER/interfaces/acados_template
+
+`ACADOS_SOURCE_DIR` names the folder, `LD_LIBRARY_PATH` its `lib`; `bin` has `t_renderer`.
+
+Version 0.6.0 needs a mend: its template `acados_solver.in.h` declares
+`nl_constr_h_hess_ux_pdiff_adj_pdiff` twice, where the second is `nl_constr_h_e_…`.
+
+Of acados only solver and sensitivity calls are timed, of ours all, shift and Python included.
+HPIPM solves to 1e-9: at its default its derivatives of a nearly active bound are too far off.
 """
 
 import ctypes
-import os
-import subprocess
 import sys
 import tempfile
-from contextlib import ExitStack
 from pathlib import Path
-from time import perf_counter
+from statistics import median
 
+import casadi as ca
 import numpy as np
 
-REPETITIONS = 20
-KINDS = {
-    "value": "prepare + feedback + dV/dθ",
-    "policy": "prepare + feedback + dV/dθ + dπ/ds + dπ/dθ",
-}
-BOUNDS = {"value": 1 / 0.25, "policy": None}
-TREE = Path(__file__).resolve().parents[1]
+from benchmarks.measuring import clock
+from benchmarks.paths import tanks_in_series
+from controllers import Parameters, RtiNmpc, ThetaBlocks, compile_functions
+from controllers.model import discretise
+from controllers.theta import symbolic_theta
+
+SAMPLES = 20
+REPETITIONS = 5
+FLAGS = "-O3 -march=native"
+TOLERANCE = 1e-3
+"""Of the largest entry, by which results may differ: more is another problem."""
+PARTS = ("prepare + feedback", "with dV/dθ", "with dV/dθ, dπ/ds and dπ/dθ")
+RESULTS = ("the actions", "dV/dθ", "dπ/dθ")
+COMPARED = ("B_Vf", "b_Vf", "B_l", "b_l", "c_f", "x_l", "x_u")
+"""Blocks of θ of which acados has derivatives; λ's is no part of its problem."""
 
 
-def measure(scenario, steps, against):
-    """Wall time of `steps` samples; AssertionError where the actions differ by more than 1e-4."""
-    from benchmarks.measuring import figure
-    from controllers.factories import tuned
-
-    controller = tuned(scenario)
-    controller.compile()
-    states = controller.problem.reference_state + np.array([0.3, 1.0]) * np.random.default_rng(
-        0
-    ).normal(size=(steps, 2))
-    seconds = {kind: {"own": [], "alone": [], "differentiated": []} for kind in KINDS}
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        np.savez(folder / "given.npz", states=states, theta=controller.theta)
-        process = stack.enter_context(
-            subprocess.Popen(
-                [against, "-P", __file__, scenario.name], cwd=folder, text=True,
-                env=os.environ | {"PYTHONPATH": str(TREE)},
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            )
-        )  # fmt: skip
-        for turn in range(REPETITIONS + 1):
-            for kind, times in seconds.items():
-                own, actions = samples(controller, states, kind)
-                found = {"own": own}
-                for what in ("alone", "differentiated"):
-                    print(what, file=process.stdin, flush=True)
-                    found[what] = float(process.stdout.readline())
-                if turn:  # the first one warms up
-                    for what, spent in found.items():
-                        times[what].append(spent / steps)
-        process.stdin.close()
-        process.wait()
-        error = np.abs(np.load(folder / "actions.npy") - actions).max()
-    assert error < 1e-4, f"the actions differ by {error:.1e}: it is not the same problem"
-    return [
-        figure(KINDS[kind], times["own"], name, times[what], at_least=bound)
-        for kind, times in seconds.items()
-        for what, name, bound in (
-            ("alone", "acados: preparation, feedback", None),
-            ("differentiated", "acados: preparation, feedback, dπ/ds", BOUNDS[kind]),
-        )
-    ]
+def measure(n, horizon):
+    """Print the row of `n` tanks and `horizon` stages."""
+    problem = tanks_in_series(n, horizon)
+    controller = RtiNmpc(problem, Parameters.naive(problem))
+    compile_functions(controller)
+    noise = np.random.default_rng(0).standard_normal((SAMPLES, n))
+    states = problem.reference_state + 0.02 * noise
+    others = {
+        "N/2 blocks": Acados(problem, horizon // 2),
+        "not condensed": Acados(problem, horizon),
+    }
+    spent = {name: [] for name in ("ours", *others)}
+    errors = np.zeros(3)
+    for turn in range(REPETITIONS + 1):
+        seconds, results, regular = pass_of_ours(controller, states)
+        passes = {"ours": seconds}
+        for name, other in others.items():
+            passes[name], found = other.walk(states)
+            errors = np.maximum(errors, typical_differences(results, found, regular))
+        if turn:  # the first one warms up
+            for name, seconds in passes.items():
+                spent[name].append(np.array(seconds) / SAMPLES)
+    for what, error in zip(RESULTS, errors, strict=True):
+        assert error < TOLERANCE, f"{what} differ by {error:.1e}: it is not the same problem"
+    cells = [f"{n}, {horizon}", f"{1e6 * median(times[-1] for times in spent['ours']):.0f}"]
+    for name in others:
+        for part in range(len(PARTS)):
+            pairs = zip(spent["ours"], spent[name], strict=True)
+            cells.append(f"{median(own[part] / other[part] for own, other in pairs):.2f}")
+    cells += [f"{error:.0e}" for error in errors]
+    cells.append(f"{regular.sum()} of {SAMPLES}")
+    print("| " + " | ".join(cells) + " |", flush=True)
 
 
-def samples(controller, states, kind):
-    """Seconds of a sample for each state, and the actions (K, m)."""
-    actions = []
+def typical_differences(ours, others, regular):
+    """Of actions, dV/dθ and dπ/dθ, each (K, …), over the largest entry of ours: the median sample.
+
+    Only samples that are `regular` count: in others the multipliers are not unique.
+
+    Where the active set is about to change, an interior point gives derivatives between both sides.
+    """
+    typical = []
+    for own, other in zip(ours, others, strict=True):
+        away = np.abs(other - own).reshape(len(own), -1).max(axis=1)[regular]
+        typical.append(np.median(away) / np.abs(own).max())
+    return np.array(typical)
+
+
+def pass_of_ours(controller, states):
+    """Seconds of a pass over the states (K, n) up to each of `PARTS`, and its results."""
+    actions, gradients, jacobians, regular = [], [], [], []
+    blocks = controller.parameters.blocks
+    compared = np.concatenate([np.arange(blocks.size)[blocks.slices[name]] for name in COMPARED])
+    seconds = np.zeros(3)
     controller.reset()
-    begin = perf_counter()
     for s in states:
+        begin = clock()
         controller.prepare()
         solution = controller.feedback(s)
-        solution.value_gradient  # noqa: B018
-        if kind == "policy":
-            solution.policy_jacobian  # noqa: B018
+        solved = clock()
+        gradient = solution.value_gradient
+        with_gradient = clock()
+        jacobian = solution.policy_jacobian
+        end = clock()
+        seconds += (solved - begin, with_gradient - begin, end - begin)
         actions.append(solution.action)
-    return perf_counter() - begin, np.array(actions)
+        gradients.append(gradient[compared])
+        jacobians.append(jacobian[:, compared])
+        regular.append(solution.licq and not solution.weakly_active)
+    results = (np.array(actions), np.array(gradients), np.array(jacobians))
+    return seconds, results, np.array(regular)
 
 
-def solver(scenario, theta):
-    """acados' solver of the scenario's problem; θ is its parameter."""
-    import acados
-    import casadi as ca
-
-    os.environ["ACADOS_SOURCE_DIR"] = acados.DIR
-    os.environ["ACADOS_PYTHON_INTERFACE_PATH"] = acados.TEMPLATE_DIR
-    for name in ("libblasfeo.so", "libhpipm.so", "libqpOASES_e.so.3.1"):
-        ctypes.CDLL(f"{acados.LIB_DIR}/{name}", ctypes.RTLD_GLOBAL)
-    from acados.acados_template import AcadosModel, AcadosOcp, AcadosOcpSolver
-
-    from controllers.model import discretise
-    from controllers.problem import Problem
-    from controllers.theta import Parameters, ThetaBlocks, symbolic_theta
-
-    problem = Problem.from_scenario(scenario)
-    blocks = ThetaBlocks.from_problem(problem)
-    parameters = Parameters.naive(problem, blocks).with_theta(theta)
-    n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    symbols = symbolic_theta(problem, blocks)
-    x, u, discount = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("discount")
-    f = discretise(problem.model, problem.sampling_time, problem.substeps)
-    x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
-    w, end = ca.vertcat(x - x_s, u - u_s), x - x_s
-    ocp, model = AcadosOcp(), AcadosModel()
-    model.name, model.x, model.u = "controller", x, u
-    model.p = ca.vertcat(symbols["theta"], discount)
-    model.disc_dyn_expr = (
-        f(x, u, problem.model.nominal_disturbance, symbols["model_parameters"]) + symbols["c_f"]
-    )
-    model.cost_expr_ext_cost = discount * (ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w))
-    model.cost_expr_ext_cost_e = discount * (
-        ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
-    )
-    ocp.model, ocp.dims.N = model, horizon
-    ocp.cost.cost_type = ocp.cost.cost_type_e = "EXTERNAL"
-    ocp.parameter_values = np.append(parameters.theta, 1.0)
-    constraints, options = ocp.constraints, ocp.solver_options
-    constraints.x0 = problem.reference_state
-    constraints.idxbu = np.arange(m)
-    constraints.lbu, constraints.ubu = problem.action_lower, problem.action_upper
-    weights = problem.penalty_linear, 2 * problem.penalty_quadratic
+def soften(ocp, problem):
+    """Make the bounds h ≥ 0 of acados' problem soft, at the prices of ours."""
+    n = problem.n_states
+    linear = np.tile(problem.penalty_linear, 2)
+    quadratic = 2 * np.tile(problem.penalty_quadratic, 2)
     for suffix in ("", "_e"):
-        for name in (f"idxbx{suffix}", f"idxsbx{suffix}"):
-            setattr(constraints, name, np.arange(n))
-        setattr(constraints, f"lbx{suffix}", parameters["x_l"])
-        setattr(constraints, f"ubx{suffix}", parameters["x_u"])
-        for name, values in zip("zZ", weights, strict=True):
-            for side in "lu":
-                setattr(ocp.cost, f"{name}{side}{suffix}", values)
-    options.nlp_solver_type, options.qp_solver = "SQP_RTI", "PARTIAL_CONDENSING_HPIPM"
-    options.qp_solver_cond_N, options.hpipm_mode = horizon // 2, "SPEED"
-    options.integrator_type, options.hessian_approx = "DISCRETE", "EXACT"
-    options.exact_hess_dyn = options.exact_hess_constr = 0
-    options.tf = float(horizon)
-    options.ext_fun_compile_flags = "-O2"
-    found = AcadosOcpSolver(ocp, json_file="controller.json", verbose=False)
-    for k in range(horizon + 1):
-        found.set(k, "p", np.append(parameters.theta, gamma**k))
-        for name, values in zip("zZ", weights, strict=True):
-            for side in "lu" if k else "":
-                found.cost_set(k, f"{name}{side}", gamma**k * values)
-    return problem, found
+        setattr(ocp.constraints, f"lh{suffix}", np.zeros(2 * n))
+        setattr(ocp.constraints, f"uh{suffix}", np.full(2 * n, 1e10))
+        setattr(ocp.constraints, f"idxsh{suffix}", np.arange(2 * n))
+        for side in "lu":
+            setattr(ocp.cost, f"z{side}{suffix}", linear)
+            setattr(ocp.cost, f"Z{side}{suffix}", quadratic)
 
 
-def worker(name):
-    """Answer each line `alone` or `differentiated` by the seconds of a pass over the states."""
-    from cosim.core.scenario import Scenario
+class Acados:
+    """acados' SQP-RTI of a problem, with the bounds of states as constraints h(x, θ)."""
 
-    with os.fdopen(os.dup(1), "w") as answers:
-        os.dup2(2, 1)  # acados and make print
-        given = np.load("given.npz")
-        problem, found = solver(Scenario.load(name), given["theta"])
-        horizon = problem.horizon
-        for line in sys.stdin:
-            x = np.tile(problem.reference_state, (horizon + 1, 1))
-            u = np.tile(problem.reference_action, (horizon, 1))
-            actions, spent = [], 0.0
-            for s in given["states"]:
-                for k in range(horizon):
-                    found.set(k, "x", x[k])
-                    found.set(k, "u", u[k])
-                found.set(horizon, "x", x[horizon])
-                found.options_set("rti_phase", 1)
-                begin = perf_counter()
-                found.solve()
-                spent += perf_counter() - begin
-                found.set(0, "lbx", s)
-                found.set(0, "ubx", s)
-                found.options_set("rti_phase", 2)
-                begin = perf_counter()
-                status = found.solve()
-                if line.strip() == "differentiated":
-                    for i in range(problem.n_states):
-                        found.eval_param_sens(i)
-                spent += perf_counter() - begin
-                actions.append(found.get(0, "u"))
-                assert status == 0, f"acados did not solve the QP: {status}"
-                x[:-1] = [found.get(k + 1, "x") for k in range(horizon)]
-                x[-1] = x[-2]
-                u[:-1] = [found.get(k + 1, "u") for k in range(horizon - 1)]
-                u[-1] = u[-2]
-            np.save("actions.npy", np.array(actions))
-            print(spent, file=answers, flush=True)
+    def __init__(self, problem, blocks):
+        """Build it: `blocks` stages remain of HPIPM's partial condensing."""
+        from acados_template import AcadosOcp, AcadosOcpSolver
+
+        self.problem = problem
+        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        theta_blocks = ThetaBlocks.from_problem(problem)
+        theta = Parameters.naive(problem, theta_blocks).theta
+        symbols = symbolic_theta(problem, theta_blocks)
+        x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+        f = discretise(problem.model, problem.sampling_time, problem.substeps)
+        end = x - ca.DM(problem.reference_state)
+        w = ca.vertcat(end, u - ca.DM(problem.reference_action))
+        ocp = AcadosOcp()
+        model = ocp.model
+        model.name = f"tanks_{n}_{horizon}_{blocks}"
+        model.x, model.u, model.p_global = x, u, symbols["theta"]
+        disturbance = problem.model.nominal_disturbance
+        step = f(x, u, disturbance, symbols["model_parameters"])
+        model.disc_dyn_expr = step + symbols["c_f"]
+        model.cost_expr_ext_cost = ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w)
+        model.cost_expr_ext_cost_e = ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
+        room = ca.vertcat(x - symbols["x_l"], symbols["x_u"] - x)
+        model.con_h_expr = model.con_h_expr_e = room
+        ocp.cost.cost_type = ocp.cost.cost_type_e = "EXTERNAL"
+        ocp.p_global_values = theta
+        constraints = ocp.constraints
+        constraints.x0 = problem.reference_state
+        constraints.idxbu = np.arange(m)
+        constraints.lbu, constraints.ubu = problem.action_lower, problem.action_upper
+        soften(ocp, problem)
+        options = ocp.solver_options
+        options.N_horizon, options.tf = horizon, float(horizon)
+        options.nlp_solver_type, options.qp_solver = "SQP_RTI", "PARTIAL_CONDENSING_HPIPM"
+        options.qp_solver_cond_N, options.hpipm_mode = blocks, "SPEED"
+        options.qp_tol = 1e-9
+        options.integrator_type, options.hessian_approx = "DISCRETE", "EXACT"
+        options.exact_hess_dyn = options.exact_hess_constr = 0
+        options.cost_scaling = problem.discount ** np.arange(horizon + 1)
+        ocp.code_gen_options.with_value_sens_wrt_params = True
+        ocp.code_gen_options.with_solution_sens_wrt_params = True
+        ocp.code_gen_options.ext_fun_compile_flags = FLAGS
+        self.folder = tempfile.TemporaryDirectory()
+        ocp.code_gen_options.code_export_directory = str(Path(self.folder.name, "code"))
+        self.solver = AcadosOcpSolver(ocp, verbose=False)
+        self.library = self.solver._AcadosOcpSolver__acados_lib
+        self.gradient = np.zeros(theta.size)
+        slices = [np.arange(theta.size)[theta_blocks.slices[name]] for name in COMPARED]
+        self.compared = np.concatenate(slices)
+
+    def walk(self, states):
+        """Seconds of acados' own calls over the states (K, n), and the actions (K, m)."""
+        problem, found, library = self.problem, self.solver, self.library
+        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        x = np.tile(problem.reference_state, (horizon + 1, 1))
+        u = np.tile(problem.reference_action, (horizon, 1))
+        out = ctypes.cast(self.gradient.ctypes.data, ctypes.POINTER(ctypes.c_double))
+        size = self.gradient.size
+        actions, gradients, jacobians = [], [], []
+        spent = np.zeros(3)
+        for s in states:
+            for k in range(horizon):
+                found.set(k, "x", x[k])
+                found.set(k, "u", u[k])
+            found.set(horizon, "x", x[horizon])
+            found.options_set("rti_phase", 1)
+            begin = clock()
+            found.solve()
+            preparation = clock() - begin
+            found.set(0, "lbx", s)
+            found.set(0, "ubx", s)
+            found.options_set("rti_phase", 2)
+            begin = clock()
+            status = found.solve()
+            solved = clock() - begin
+            assert status == 0, f"acados did not solve the QP: {status}"
+            begin = clock()
+            library.ocp_nlp_eval_lagrange_grad_p(found.nlp_solver, found.nlp_in, b"p_global", out)
+            gradient = clock() - begin
+            gradients.append(self.gradient[self.compared])
+            begin = clock()
+            for i in range(n):
+                library.ocp_nlp_eval_param_sens(found.nlp_solver, b"ex", 0, i, found.sens_out)
+            slopes = clock() - begin
+            rows = np.zeros((m, size))
+            for i in range(m):
+                found.reset_sens_out()
+                found.set(0, "sens_u", np.eye(m)[i])
+                begin = clock()
+                library.ocp_nlp_eval_solution_sens_adj_p(
+                    found.nlp_solver, found.nlp_in, found.sens_out, b"p_global", 0, out
+                )
+                slopes += clock() - begin
+                rows[i] = self.gradient
+            jacobians.append(rows[:, self.compared])
+            solved += preparation
+            spent += (solved, solved + gradient, solved + gradient + slopes)
+            actions.append(found.get(0, "u"))
+            x[:-1] = [found.get(k + 1, "x") for k in range(horizon)]
+            x[-1] = x[-2]
+            u[:-1] = [found.get(k + 1, "u") for k in range(horizon - 1)]
+            u[-1] = u[-2]
+        return spent, (np.array(actions), np.array(gradients), np.array(jacobians))
 
 
 if __name__ == "__main__":
-    worker(sys.argv[1])
+    print(
+        "n, N; ours in µs; ÷ acados with N/2 blocks, then not condensed, each by part; differences"
+    )
+    for word in sys.argv[1:]:
+        measure(*(int(number) for number in word.split(",")))

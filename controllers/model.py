@@ -504,16 +504,16 @@ def by_name(quantities: Sequence[Quantity], column: ca.SX) -> dict[str, ca.SX]:
 
 
 def runge_kutta(
-    rate: Callable[[ca.SX], ca.SX],
-    x: ca.SX,
+    rate: Callable[[Any], Any],
+    x: Any,
     h: float | ca.SX,
     substeps: int,
-) -> ca.SX:
+) -> Any:
     """x after some classical RK4 steps of x' = rate(x).
 
     Args:
-        rate: Right-hand side.
-        x: Start: a vector, or vectors side by side.
+        rate: Right-hand side, of symbols or of arrays.
+        x: Start: a vector, or vectors side by side; symbols or an array.
         h: Length of a step.
         substeps: Number of steps.
     """
@@ -680,14 +680,8 @@ class _Predictor:
             column = value[:, :, None]
             return np.concatenate([column, variation], axis=2)
 
-        for _ in range(substeps):
-            k1 = rate(state)
-            k2 = rate(state + h / 2 * k1)
-            k3 = rate(state + h / 2 * k2)
-            k4 = rate(state + h * k3)
-            slopes = k1 + 2 * k2 + 2 * k3 + k4
-            state = state + h / 6 * slopes
-        return state
+        carried: Array = runge_kutta(rate, state, h, substeps)
+        return carried
 
 
 def measure_integration(

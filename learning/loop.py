@@ -174,8 +174,7 @@ class TrainingLoop:
         covariance = getattr(estimator, "covariance", None)
         if self._loop.y is None or covariance is None:
             return None
-        # Rounding may leave less than nothing.
-        variances: Vector = np.maximum(covariance.diagonal(), 0.0)
+        variances: Vector = covariance.diagonal()
         return variances
 
     @property

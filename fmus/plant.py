@@ -218,7 +218,9 @@ def build_plant(
     """Compile a plant's equations into an FMU, for co-simulation and model exchange.
 
     It has snapshots and their serialisation, draws that are a function of seed and sample, filters
-    of them whose values are part of its state, and fourth-order Runge–Kutta steps of at most 1 s.
+    of them whose values are part of its state. It is integrated by fourth-order Runge–Kutta steps
+    of at most 1 s, which are cut where they would err by more than about 1e-6 of a state; a step
+    in which the plant changes too fast for that, or grows without bound, is an error.
 
     Args:
         model: the table of its variables, by `plant_model`.

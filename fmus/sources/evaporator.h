@@ -6,6 +6,7 @@
 #ifndef EVAPORATOR_H
 #define EVAPORATOR_H
 
+#include <math.h>
 #include <stdint.h>
 
 #include "variables.h"
@@ -54,6 +55,14 @@ static Rates held_rates(const double v[N_VARIABLES]) {
     rates.px = slope * v[VR_b] * n;
     rates.pp = (slope * v[VR_a] + condenser * v[VR_d]) * n;
     return rates;
+}
+
+/* Bound of both eigenvalues' size, per second, for X2 up to 100 % and P2 up to 400 kPa: the larger
+ * entry on the diagonal of the Jacobian, and the root of the product of the others. */
+static double fastest_rate(Rates r) {
+    const double X2 = VARIABLES[VR_X2].max, P2 = VARIABLES[VR_P2].max;
+    const double diagonal = fabs(r.x1) + 2.0 * fabs(r.xx) * X2 + fabs(r.xp) * P2;
+    return fmax(diagonal, fabs(r.pp)) + sqrt(fabs(r.xp * r.px) * X2);
 }
 
 static Rates scaled(Rates rates, double h) {

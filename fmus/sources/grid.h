@@ -9,9 +9,12 @@
 #include <math.h>
 #include <stdint.h>
 
-/* s; the error of a 60 s sample is then below 5e-10 relative for X2 in [5, 100] %, P2 in [30, 90] kPa,
- * inputs and disturbances in their default ranges. */
+/* s; the error of the evaporator's 60 s sample is then below 5e-10 relative for X2 in [5, 100] %,
+ * P2 in [30, 90] kPa, inputs and disturbances in their default ranges. */
 #define MAX_INTEGRATION_STEP 1.0
+
+/* A plant that is too fast for a step is integrated in parts of it, this many at most. */
+#define MAX_PARTS 16384
 
 typedef struct {
     double step;           /* length of an integration step, s */

@@ -6,20 +6,20 @@
 #include "integration.h"
 #include "states.h"
 
-/* Integration steps in one call: half a year of seconds, at most about two seconds of computing. */
+/* Steps of the grid in one call: half a year of seconds, at most about two seconds of computing. */
 #define MAX_STEPS_PER_CALL 16777216
 
-/* Go through the samples between two positions. */
-static void advance(State *state, Grid grid, GridPosition from, GridPosition to) {
+/* Go through the samples between two positions; returns 0 where the plant is too fast. */
+static int advance(State *state, Grid grid, GridPosition from, GridPosition to) {
     int64_t sample = sample_of(grid, from.point);
     for (;;) {
         const GridPosition next = {(sample + 1) * grid.steps, 0.0};
         const int last = to.point < next.point;
         move_to_sample(state, sample);
-        if (to.point == from.point && to.fraction == from.fraction) return;
+        if (to.point == from.point && to.fraction == from.fraction) return 1;
         realise(state);
-        integrate(state->v, grid, from, last ? to : next);
-        if (last) return;
+        if (!integrate(state->v, grid, from, last ? to : next)) return 0;
+        if (last) return 1;
         from = next;
         sample++;
     }
@@ -37,7 +37,13 @@ static Status do_step(Instance *instance, const char *function, double time, dou
         return report(instance, DISCARD, "%s: step size %g s needs more than %d integration steps.",
                       function, h, MAX_STEPS_PER_CALL);
     before = *state;
-    advance(state, grid, from, to);
+    if (!advance(state, grid, from, to)) {
+        *state = before;
+        return report(instance, ERROR,
+                      "%s: the states change too fast between %g s and %g s, or grow without "
+                      "bound: steps of %.2g s do not follow them.",
+                      function, time, end, grid.step / MAX_PARTS);
+    }
     for (int i = 0; i < N_STATES; i++) {
         if (isfinite(state->v[STATE_REFERENCES[i]])) continue;
         *state = before;

@@ -9,7 +9,7 @@
 #define FMI3_FUNCTION_PREFIX evaporator_
 #endif
 
-#define MODEL_TOKEN "{b6addcc1-5211-5d24-8414-8ed1e29afb40}"
+#define MODEL_TOKEN "{56329071-43cb-5d1e-b5eb-b7f0fdfbf664}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
 #define LAYOUT_DIGEST UINT64_C(0x9af9dc9b348a14f3)

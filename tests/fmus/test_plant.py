@@ -4,6 +4,8 @@ from pathlib import Path
 import fmpy
 import numpy as np
 import pytest
+from fmpy.fmi1 import FMICallException
+from scipy.linalg import expm
 
 from fmus import PLATFORMS, BuildError, present
 from fmus.build import build_folder
@@ -38,7 +40,7 @@ def model(disturbances: int = 0):
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("disturbances", [0, 3])
 def test_any_number_of_disturbances(tmp_path: Path, version, disturbances: int) -> None:
-    """The step response is exact to the integrator's order; draws of odd numbers fit."""
+    """The step response is exact; draws of odd numbers fit."""
     fmu = build_plant(model(disturbances), EQUATIONS, tmp_path / "lag.fmu", version)
     names = [f"d{i}" for i in range(disturbances)]
     result = fmpy.simulate_fmu(
@@ -46,11 +48,62 @@ def test_any_number_of_disturbances(tmp_path: Path, version, disturbances: int) 
         start_values={"u": 3.0, "seed": 4}, fmi_type="CoSimulation",
     )  # fmt: skip
     exact = 3.0 - 2.0 * np.exp(-result["time"])
-    np.testing.assert_allclose(result["x"], exact, rtol=2e-3)
+    np.testing.assert_allclose(result["x"], exact, rtol=1e-6)
     np.testing.assert_array_equal(result["y"], 2.0 * result["x"])
     for name in names:
         assert np.all(np.abs(result[name] - 0.5) <= 0.25)
         assert len(set(result[name])) == 11
+
+
+def linear_system(rates: np.ndarray):
+    """Table and equations of x' = rates x, sampled each second."""
+    n = len(rates)
+    table = plant_model(
+        "linear",
+        states=[Signal(f"x{i}", "m", 1.0, description="state") for i in range(n)],
+        inputs=[Signal("u", "m", 0.0, -1.0, 1.0, "nothing")],
+        disturbances=[],
+        outputs=[Signal("y", "m", description="first state")],
+        sampling_time=1.0,
+    )
+    lines = ["#pragma once", '#include "variables.h"', "static void evaluate(double *v) {"]
+    for i, row in enumerate(rates):
+        terms = [f"{rate!r} * v[VR_x{j}]" for j, rate in enumerate(row.tolist())]
+        lines.append(f"    v[VR_der_x{i}] = {' + '.join(terms)};")
+    lines.append("    v[VR_y] = v[VR_x0];\n}")
+    return table, "\n".join(lines)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_plant_of_any_speed_is_integrated_to_its_flow(tmp_path: Path, seed: int) -> None:
+    """Modes from 0.1/s to 1000/s, sampled each second, beside the matrix exponential."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 5))
+    basis = rng.normal(size=(n, n)) + 2.0 * np.eye(n)
+    modes = -(10.0 ** rng.uniform(-1.0, 3.0, n))
+    rates = basis @ np.diag(modes) @ np.linalg.inv(basis)
+    fmu = build_plant(*linear_system(rates), tmp_path / "linear.fmu", 2 + seed % 2)
+    states = [f"x{i}" for i in range(n)]
+    result = fmpy.simulate_fmu(
+        str(fmu), stop_time=4.0, output_interval=0.8, output=states, fmi_type="CoSimulation",
+    )  # fmt: skip
+    for row in result:
+        exact = expm(rates * row["time"]) @ np.ones(n)
+        computed = [row[name] for name in states]
+        np.testing.assert_allclose(computed, exact, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("rate", [300.0, -1e6])
+def test_a_plant_that_explodes_or_is_too_stiff_is_refused(tmp_path: Path, rate: float) -> None:
+    table, equations = linear_system(np.array([[rate]]))
+    fmu = build_plant(table, equations, tmp_path / "linear.fmu")
+    told: list[str] = []
+    with pytest.raises(FMICallException):
+        fmpy.simulate_fmu(
+            str(fmu), stop_time=10.0, output_interval=1.0, output=["x0"], fmi_type="CoSimulation",
+            logger=lambda *words: told.append(words[-1].decode()),
+        )  # fmt: skip
+    assert "the states change too fast" in told[-1]
 
 
 def test_equations_that_do_not_compile_are_told(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The equations, against an independent implementation and the known steady state."""
 
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 from fmus.evaporator import EVAPORATOR
@@ -66,9 +67,31 @@ def test_step_is_within_the_documented_5e_10_of_a_tight_integration(open_fmu, ve
         np.testing.assert_allclose(plant.get("X2", "P2"), exact, rtol=5e-10, atol=0)
 
 
+FAST = [
+    {"M": 1.0},
+    {"C": 0.1, "F3": 100.0},
+    {"M": 1.0, "C": 0.1, "h": 1.0, "F3": 200.0},
+]
+"""In the ranges of the parameters, with time constants far below an integration step of 1 s."""
+
+
+@pytest.mark.parametrize("fast", FAST)
+@pytest.mark.parametrize("size", [60.0, 2.7])
+def test_a_fast_evaporator_is_integrated_in_shorter_steps(plant, fast, size) -> None:
+    p = NUMBERS | fast
+    x, u, d = np.array([25.0, 50.0]), np.array([200.0, 200.0]), np.array([5.0, 10.0, 40.0, 25.0])
+    start(plant, x, u, d, p)
+    plant.step(0.0, size)
+    exact = solve_ivp(
+        lambda t, y: evaporator(y, u, d, **p)["rates"], (0.0, size / 60.0), x,
+        method="Radau", rtol=1e-11, atol=1e-11,
+    ).y[:, -1]  # fmt: skip
+    np.testing.assert_allclose(plant.get("X2", "P2"), exact, rtol=1e-5, atol=0)
+
+
 def test_integration_is_of_fourth_order(open_fmu, version: int) -> None:
     """Halving the step of a non-stiff problem divides the error by about 2⁴."""
-    p = NUMBERS | {"M": 1.0}
+    p = NUMBERS | {"M": 10.0}
     x, u, d = np.array([25.0, 50.0]), np.array([200.0, 200.0]), np.array([5.0, 10.0, 40.0, 25.0])
     exact = solve_ivp(
         lambda t, y: evaporator(y, u, d, **p)["rates"], (0.0, 0.2), x,

@@ -68,13 +68,12 @@ def test_a_step_that_tells_of_the_values_inside_computes_the_same(open_fmu, tell
     assert [time for time, *_ in told] == sorted({*inside, *ends[1:]})
 
 
-def test_parameters_that_make_the_integration_diverge_are_an_error(refused, plant, telling) -> None:
-    """All in range, but so stiff that steps of 1 s are unstable."""
+def test_parameters_that_make_the_plant_too_fast_are_an_error(refused, plant, telling) -> None:
+    """All in range, but with a time constant of some microseconds."""
     for instance in (plant, telling[0]):
         instance.initialise(h=10.0, F3=1000.0, lambda_=1.0, C=0.1, M=1.0)
         before = instance.run(0)
         status, text = refused(instance, lambda each=instance: each.step(0.0, 600.0))
         assert status == ERROR
-        assert "left the finite numbers" in text
+        assert "the states change too fast between 0 s and" in text
         assert instance.run(0) == before
-    assert telling[1]

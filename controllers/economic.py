@@ -851,7 +851,12 @@ def tune(problem: Problem, blocks: ThetaBlocks | None = None) -> EconomicTuning:
         "B_lambda": _symmetric(0.5 * initial),
         "b_lambda": steady.costate + initial @ shift_x,
     }
-    rounded = {name: _rounded(value) for name, value in values.items()}
+    ranges = Scale.from_problem(problem).ranges
+    rounded = {}
+    for name, value in values.items():
+        # A block is of states, or of states and actions.
+        ranges_of_block = ranges[: len(value)]
+        rounded[name] = _rounded(value, ranges_of_block)
     return EconomicTuning(
         parameters=Parameters.naive(problem, blocks).replace(rounded),
         steady_state=steady,
@@ -916,14 +921,22 @@ def linearisation_substeps(problem: Problem) -> int:
     )
 
 
-def _rounded(block: Array) -> Array:
-    """Entries to six digits, 0 below 1e-9 of the largest, without a solver's last bits."""
+def _rounded(block: Array, ranges: Array) -> Array:
+    """Entries to six digits, 0 below 1e-9 of the largest, without a solver's last bits.
+
+    Args:
+        block: A vector (k,) or a matrix (k, k) in units of the problem.
+        ranges: Of the variables, (k,): over them the entries are compared, so that no unit decides
+            which are zero.
+    """
     # The last bits are the solver's and differ between platforms; θ files must not.
-    largest = float(np.abs(block).max(initial=0.0))
-    least = 1e-9 * largest
+    over_ranges = np.abs(block) * ranges
+    if block.ndim == 2:
+        over_ranges = over_ranges * ranges[:, None]
+    least = 1e-9 * over_ranges.max(initial=0.0)
     rounded = np.zeros(block.shape)
     for place, x in np.ndenumerate(block):
-        if abs(x) > least:
+        if over_ranges[place] > least:
             rounded[place] = float(f"{x:.6g}")
     return rounded
 

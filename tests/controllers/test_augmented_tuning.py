@@ -125,6 +125,14 @@ def test_a_linear_cost_on_a_bilinear_plant_is_tuned(seed):
     assert (result.addition.size > 0) == (seed == 8)
 
 
+def test_the_stage_cost_of_theta_is_convex_where_units_differ_by_decades():
+    """θ is rounded: entries of a variable in large units are small, and no rounding's."""
+    problem, *_ = linear_plant(0)
+    width = problem.upper - problem.lower
+    stage_cost = tune(problem).parameters["B_l"] * np.outer(width, width)
+    assert np.linalg.eigvalsh(stage_cost)[0] > 0
+
+
 def test_what_was_added_is_in_the_certificate():
     problem, *_ = linear_plant(8, bilinear=0.3)
     result = tune(problem)

@@ -332,6 +332,7 @@ def estimate_persistence(
     *,
     doubt: float,
     largest: float = 0.99,
+    smallest: float = 1e-4,
 ) -> Array:
     """Φ by least squares; zero where independent errors would look like it.
 
@@ -345,6 +346,8 @@ def estimate_persistence(
         n_earlier: number of errors of which that was one.
         doubt: standard deviations by which the ratio must exceed its mean.
         largest: largest spectral radius of Φ; errors that last longer are a mean.
+        smallest: combinations of outputs whose errors are below this share of the largest count as
+            free of errors.
 
     Returns:
         Φ, (K, K).
@@ -357,7 +360,9 @@ def estimate_persistence(
     size = np.where(size > 0, size, 1.0)
     scaled_later = later / size
     scaled_before = before / size
-    solution, *_ = np.linalg.lstsq(scaled_before, scaled_later, rcond=1e-8)
+    # A combination of outputs that hardly errs says nothing of the next errors. One disturbance of
+    # many states makes such: what is left is the model's curvature, and Φ would be huge in it.
+    solution, *_ = np.linalg.lstsq(scaled_before, scaled_later, rcond=smallest)
     weight = n_earlier / (count + n_earlier)
     # Rows of errors multiply from the left: Φᵀ, in the units of the scaled errors.
     scaled_earlier = earlier.T * size[:, None] / size

@@ -129,6 +129,16 @@ def test_an_earlier_estimate_counts_like_errors_seen_here(rng):
     assert found == pytest.approx(PHI, abs=0.02)
 
 
+def test_one_disturbance_of_three_states_persists_as_it_does(rng):
+    """All outputs err alike, but for a ten-millionth, which says nothing of the next errors."""
+    (source,) = autoregression(rng, 2000, 0.5 * np.eye(2)).T[:1]
+    errors = np.outer(source, [1.0, 2.0, -1.0])
+    errors += 1e-7 * rng.standard_normal(errors.shape)
+    phi = estimate_persistence(errors[1:], errors[:-1], np.zeros((3, 3)), 0, doubt=4.0)
+    assert phi @ [1.0, 2.0, -1.0] == pytest.approx([0.5, 1.0, -0.5], abs=0.1)
+    assert np.abs(phi).max() < 1.0
+
+
 def test_the_covariance_solves_lyapunovs_equation():
     gamma = error_covariance(PHI, SIGMA)
     assert gamma == pytest.approx(PHI @ gamma @ PHI.T + SIGMA)

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import null_space, solve_discrete_are, solve_discrete_lyapunov
 
-from controllers.errors import TuningError, TuningWarning, warn
+from controllers.errors import TuningError, TuningWarning
 from controllers.model import discretise, runge_kutta
 from controllers.problem import Problem, Scale
 from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
+from cosim.core.errors import warn
 from cosim.core.protocols import Array
 
 FORCE_WEIGHT = 1e-3

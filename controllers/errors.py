@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, ClassVar
 
 from cosim.core.errors import CosimError, CosimWarning
@@ -56,17 +55,3 @@ class QpError(ControllerError):
         super().__init__(message)
         self.status = status
         self.qp = qp
-
-
-def warn(message: str, category: type[CosimWarning]) -> None:
-    """Warn the user, once for each message.
-
-    Args:
-        message: One line.
-        category: Class of the warning.
-    """
-    warnings.warn_explicit(message, category, category.__module__, 0, registry=_WARNED)
-
-
-_WARNED: dict[Any, Any] = {}
-"""The messages that were shown: Python's own record goes by the line of code that warns."""

@@ -28,7 +28,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controllers.errors import ControllerError, ModelError, ModelWarning, ParameterError, warn
+from controllers.errors import ControllerError, ModelError, ModelWarning, ParameterError
 from controllers.estimator_sensitivities import FilterSensitivities
 from controllers.filter_engine import FilterEngine
 from controllers.filter_model import bound_widths, filter_model
@@ -44,6 +44,7 @@ from controllers.functions import (
 from controllers.problem import Problem
 from controllers.rti import RtiSolution, compile_functions
 from controllers.theta import Parameters, ThetaBlocks, noise_block
+from cosim.core.errors import warn
 from cosim.core.modules import load_plugin
 from cosim.core.protocols import Controller, Matrix, Solution, Vector
 from cosim.core.scenario import EstimatorTable, Scenario, SensorTable

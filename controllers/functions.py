@@ -19,7 +19,8 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
-from controllers.errors import ControllerError, ModelWarning, warn
+from controllers.errors import ControllerError, ModelWarning
+from cosim.core.errors import warn
 from cosim.core.files import cache_folder, lock, temporary_folder
 from cosim.core.processes import child_process, processor_seconds
 from cosim.core.protocols import Matrix, Vector

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.errors import ControllerError, ModelError, ModelWarning, warn
+from controllers.errors import ControllerError, ModelError, ModelWarning
 from controllers.functions import (
     Definition,
     StackedFunction,
@@ -33,6 +33,7 @@ from controllers.theta import (
     symbolic_given,
     symbolic_stage,
 )
+from cosim.core.errors import warn
 from cosim.core.protocols import Matrix, Vector
 from cosim.core.validation import instead
 

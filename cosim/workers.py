@@ -8,19 +8,20 @@ import signal
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Self, TextIO, TypeVar
 
 import numpy as np
 
-from cosim.core.errors import EvaluationError
+from cosim.core.errors import CosimWarning, EvaluationError, warn
 from cosim.core.files import temporary_folder
 from cosim.core.modules import OURS, import_folders, import_from
 from cosim.core.processes import Terminated, follow_parent, without_interrupts
@@ -156,10 +157,12 @@ class Report(Generic[Outcome]):
     Attributes:
         facts: what it ran with.
         result: of the item, or its failure.
+        warnings: message and class of each warning that a process of its own has given.
     """
 
     facts: Mapping[str, str]
     result: Outcome | Failure
+    warnings: tuple[tuple[str, type[CosimWarning]], ...] = ()
 
 
 def ignored(samples: int) -> None:
@@ -250,6 +253,9 @@ def done(
                     item = remaining.pop(key)
                     fruitless = 0
                     result = report.result
+                    # Each process would say it once more.
+                    for message, category in report.warnings:
+                        warn(message, category)
                     if not isinstance(result, Failure):
                         refusal = item.conditions.refusal(report.facts)
                         result = refusal or result
@@ -275,7 +281,29 @@ def begin_worker(parent: int) -> None:
     # Python sets a handler in the main thread alone.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    warnings.showwarning = _keep_warning
     follow_parent(parent)
+
+
+_kept_warnings: list[tuple[str, type[CosimWarning]]] = []
+"""Of this worker, since its last report."""
+
+
+def _keep_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+    *,
+    show: Callable[..., None] = warnings.showwarning,
+) -> None:
+    """Keep one of our own warnings for the report; show another's as Python does."""
+    if issubclass(category, CosimWarning):
+        _kept_warnings.append((str(message), category))
+    else:
+        show(message, category, filename, lineno, file, line)
 
 
 class _Board:
@@ -312,7 +340,10 @@ def _with_key(
     item: Item[Outcome],
     progress: SamplesDone = ignored,
 ) -> tuple[Key, Report[Outcome]]:
-    return key, perform(item, progress)
+    report = perform(item, progress)
+    report = replace(report, warnings=tuple(_kept_warnings))
+    _kept_warnings.clear()
+    return key, report
 
 
 def _reports(

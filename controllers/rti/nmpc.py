@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.errors import ControllerError, ModelWarning, ParameterError, QpError, warn
+from controllers.errors import ControllerError, ModelWarning, ParameterError, QpError
 from controllers.export.core import (
     ENGINE_SOURCES,
     STATUSES,
@@ -47,6 +47,7 @@ from controllers.sensitivities import (
 )
 from controllers.stabilised import Stages, solve_stabilised
 from controllers.theta import Parameters, nominal_given
+from cosim.core.errors import warn
 from cosim.core.protocols import CompiledLoop, Matrix, Vector
 from cosim.core.scenario import Scenario
 

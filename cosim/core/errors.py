@@ -1,5 +1,6 @@
 """Errors whose message is meant for the user: `CosimError`, and those of the co-simulation."""
 
+import warnings
 from typing import Any
 
 from fmus.errors import CosimError
@@ -21,6 +22,7 @@ __all__ = [
     "ScenarioError",
     "StudyError",
     "TrajectoryError",
+    "warn",
 ]
 
 
@@ -84,3 +86,17 @@ class StudyError(CosimError):
 
 class FailedRunsError(StudyError):
     """Runs of a study that failed, while all others were done."""
+
+
+def warn(message: str, category: type[CosimWarning]) -> None:
+    """Warn the user, once for each message.
+
+    Args:
+        message: One line.
+        category: Class of the warning.
+    """
+    warnings.warn_explicit(message, category, category.__module__, 0, registry=_WARNED)
+
+
+_WARNED: dict[Any, Any] = {}
+"""The messages that were shown: Python's own record goes by the line of code that warns."""

@@ -10,11 +10,12 @@ import warnings
 import pytest
 
 from benchmarks.builds import SYSTEMS, built, preset_sources
-from controllers import ControllerError, Parameters, RtiNmpc, errors, functions
+from controllers import ControllerError, Parameters, RtiNmpc, functions
 from controllers.errors import ModelWarning
 from controllers.factories import naive
 from controllers.functions import BUILDS, build_name, description, find_compiler, library
 from cosim import FmuPlant, Scenario, simulate
+from cosim.core import errors
 from fmus import present
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.sampling import evaporator_problem

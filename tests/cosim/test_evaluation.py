@@ -1,16 +1,17 @@
 import json
 import sys
+import warnings
 
 import numpy as np
 import pytest
 
 from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
-from cosim.core.errors import EvaluationError
+from cosim.core.errors import CosimWarning, EvaluationError
 from cosim.evaluation import named_controllers
 from cosim.workers import done
 from tests.helpers.loop import Proportional, hold, proportional
-from tests.helpers.workers import LEDGER, always_dying, mortal, noting, sluggish
+from tests.helpers.workers import LEDGER, always_dying, mortal, noting, sluggish, warning
 
 BOTH = {"proportional": proportional, "hold": hold}
 
@@ -108,6 +109,17 @@ def test_a_killed_worker_loses_nothing(paper, ledger):
     assert len(ledger()) > 5, "no run was begun twice, so none was killed"
     whole = evaluate(paper, {"mortal": mortal}, 5, 20)
     assert contents(broken) == contents(whole)
+
+
+@pytest.mark.slow
+def test_what_every_worker_warns_of_is_said_once(paper, capfd, monkeypatch):
+    monkeypatch.setenv("PYTHONWARNINGS", "default")
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("default")
+        evaluate(paper, {"warning": warning, "again": warning}, 4, 20, jobs=2)
+    ours = [each for each in shown if issubclass(each.category, CosimWarning)]
+    assert [str(each.message) for each in ours] == ["this controller warns"]
+    assert "this controller warns" not in capfd.readouterr().err
 
 
 def test_controllers_may_be_given_by_name(paper):

@@ -6,6 +6,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from cosim.core.errors import CosimWarning, warn
 from tests.helpers.loop import Proportional
 
 LEDGER = "COSIM_TEST_LEDGER"
@@ -42,6 +43,11 @@ class Mortal(Noting):
 
 def mortal(scenario):
     return Mortal(scenario)
+
+
+def warning(scenario):
+    warn("this controller warns", CosimWarning)
+    return Proportional(scenario)
 
 
 class Dying(Proportional):

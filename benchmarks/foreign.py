@@ -21,7 +21,7 @@ import numpy as np
 from cosim import FmuPlant, Scenario
 from cosim.core.errors import CosimError
 from cosim.core.result import markdown_table
-from cosim.plant.draft import action_limits, elements, start_value
+from cosim.plant.draft import elements, limits_of, start_value
 from cosim.plant.fmi import number, unpack
 from cosim.plant.wiring import refusals
 
@@ -54,7 +54,7 @@ def scenario_of(fmu, archive):
     ]
     actions = first_elements(description, "input") or tunable[:1]
     start = [start_value(archive, name) for name in actions]
-    limits = [action_limits(archive, *pair) for pair in zip(actions, start, strict=True)]
+    limits = [limits_of(archive, *pair) for pair in zip(actions, start, strict=True)]
     internal = number(description.coSimulation.fixedInternalStepSize, 0.0)
     preferred = number(getattr(description.defaultExperiment, "stepSize", None), 0.0)
     n = len(states)

@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache, wraps
-from math import exp, sqrt
+from math import exp, isfinite, sqrt
 from pathlib import Path
 from typing import Concatenate, Literal, NamedTuple, ParamSpec, TypeVar
 
@@ -727,6 +727,21 @@ class Problem:
         """Build the problem that a scenario describes; its model is named `module:factory`."""
         settings = scenario.controller
         model = load_model(settings.model)
+        unbounded = []
+        for name, low, high in zip(
+            scenario.plant.states,
+            scenario.state_lower,
+            scenario.state_upper,
+            strict=True,
+        ):
+            if not (isfinite(low) and isfinite(high)):
+                unbounded.append(name)
+        if unbounded:
+            raise ModelError(
+                f"scenario '{scenario.name}': bounds.state_lower and state_upper of "
+                f"{', '.join(unbounded)} must be finite for this controller, which takes a scale "
+                "from them; a bound that is never reached does no harm"
+            )
         return cls(
             model=model,
             sampling_time=scenario.sampling_time,

@@ -509,12 +509,16 @@ class Scenario(Shown, Table):
                 raise ValueError(
                     f"plant: names '{name}' twice among states, actions and disturbances"
                 )
-        # An FMU draws by itself: a law that cannot be written to it would not be in force.
+        # An FMU draws by itself: a law that cannot be written to it would not be in force. One that
+        # has no choice of laws has one, which the scenario names; its ranges can be written.
         law = self.disturbance.law
         mapping = plant.mapping
-        is_mapped = mapping.law and law in mapping.law_codes
+        is_mapped = law in mapping.law_codes if mapping.law else bool(mapping.ranges)
         if law != "none" and not is_mapped:
-            raise ValueError(f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes")
+            raise ValueError(
+                f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes, or "
+                "plant.mapping.ranges of an FMU that has this law alone"
+            )
         constants = self.disturbance.time_constant or ()
         if any(constants) and not mapping.time_constant:
             raise ValueError(

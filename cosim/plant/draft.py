@@ -209,6 +209,12 @@ def draft_scenario(
         model = model or f"controllers.{plant_name}:model"
     if model is not None:
         document["controller"]["model"] = model
+        # A controller's scaling wants both bounds of each state; others can do without.
+        limits = []
+        for name, value in zip(roles.states, x.tolist(), strict=True):
+            limits.append(limits_of(archive, name, value))
+        document["bounds"]["state_lower"] = [low for low, _ in limits]
+        document["bounds"]["state_upper"] = [high for _, high in limits]
     if str(fmu) not in SHIPPED_FMUS:
         # A file on another drive keeps its absolute path.
         with suppress(ValueError):
@@ -257,7 +263,7 @@ def first_document(
     action_lower = []
     action_upper = []
     for name, value in zip(roles.actions, u.tolist(), strict=True):
-        low, high = action_limits(archive, name, value)
+        low, high = limits_of(archive, name, value)
         action_lower.append(low)
         action_upper.append(high)
     state_lower = []
@@ -480,19 +486,19 @@ def start_value(fmu: UnpackedFmu, name: str) -> float:
     return number(stated[element], 0.0)
 
 
-def action_limits(
+def limits_of(
     fmu: UnpackedFmu,
     name: str,
     value: float,
 ) -> tuple[float, float]:
-    """Range of an action: the FMU's, and where it states none, `value` ± its magnitude.
+    """Range of a variable: the FMU's, and where it states none, `value` ± its magnitude.
 
     A bound that is no bound (`UnpackedFmu.range`) counts as not stated.
 
     Args:
         fmu: states the range.
-        name: of the action.
-        value: its start value.
+        name: of the variable.
+        value: its start value, or that of a steady state.
     """
     low, high = fmu.range(name)
     # A start value may lie beyond the range, and then neither bound would hold it.
@@ -533,26 +539,13 @@ def _remarks(
         "controller": "the undisturbed plant's steady state nearest to its start values; "
         "`cosim tuning` prints the cheapest one",
     }
-    # A state may well have one bound alone; an action is sampled between two.
-    unbounded = []
-    for name in plant["states"]:
-        if not any(map(isfinite, fmu.range(name))):
-            unbounded.append(name)
-    if unbounded:
-        remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(unbounded)}"
-    open_ended = []
-    for name in plant["actions"]:
-        if not all(map(isfinite, fmu.range(name))):
-            open_ended.append(name)
-    if open_ended:
-        remarks["bounds.action_lower"] = (
-            f"CHECK: the FMU does not bound {', '.join(open_ended)} on both sides; what is missing "
-            "is its start value ± its magnitude"
-        )
+    remarks |= _remarks_of_limits(document, fmu)
     if "initial_state" not in plant["mapping"]:
         remarks["controller"] = "CHECK: the plant as it starts; it can start nowhere else"
     if document["disturbance"]["law"] == "none":
         remarks["disturbance"] = f"CHECK: {NO_NOISE}"
+    elif "law" not in plant["mapping"]:
+        remarks["disturbance"] = "CHECK: the FMU has no choice of laws; this one is a guess"
     elif "time_constant" in plant["mapping"] and "time_constant" not in document["disturbance"]:
         example = [300.0] * len(plant["disturbances"])
         remarks["disturbance"] = (
@@ -754,6 +747,42 @@ def _mapping(fmu: UnpackedFmu, noise: Sequence[str]) -> dict[str, Any]:
         if parameters and all(is_parameter(name, REALS) for name in parameters):
             table[field] = parameters
     return table
+
+
+def _remarks_of_limits(document: dict[str, Any], fmu: UnpackedFmu) -> dict[str, str]:
+    """Remark on each list of bounds of which the FMU does not state all."""
+    plant = document["plant"]
+    remarks = {}
+    # Without a model a state may well have one bound alone, or none.
+    has_model = "model" in document["controller"]
+    unbounded = []
+    half_bounded = []
+    for name in plant["states"]:
+        stated = [isfinite(limit) for limit in fmu.range(name)]
+        if not any(stated):
+            unbounded.append(name)
+        if not all(stated):
+            half_bounded.append(name)
+    if has_model and half_bounded:
+        remarks["bounds.state_lower"] = _guessed_limits(half_bounded, "steady")
+    elif unbounded:
+        remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(unbounded)}"
+    # An action is sampled between two.
+    open_ended = []
+    for name in plant["actions"]:
+        if not all(map(isfinite, fmu.range(name))):
+            open_ended.append(name)
+    if open_ended:
+        remarks["bounds.action_lower"] = _guessed_limits(open_ended, "start")
+    return remarks
+
+
+def _guessed_limits(names: Sequence[str], value: str) -> str:
+    """Remark on the limits of variables, which are about their `value`."""
+    return (
+        f"CHECK: the FMU does not bound {', '.join(names)} on both sides; what is missing "
+        f"is its {value} value ± its magnitude"
+    )
 
 
 DIFFERENCE = 1e-5

@@ -226,6 +226,10 @@ class Wiring:
             code = mapping.law_codes[law.law]
             codes.append(code)
         stochastic = float(law.law != "none")
+        ranges = law.ranges
+        # Without a switch nothing else keeps the FMU from drawing.
+        if not stochastic and not mapping.stochastic:
+            ranges = (0.0,) * len(mapping.ranges)
         starts: list[tuple[Place, float]] = []
 
         def add(
@@ -244,7 +248,7 @@ class Wiring:
         add("plant.mapping.stochastic", mapping.stochastic, [stochastic])
         add("plant.mapping.law", mapping.law, codes)
         add("plant.mapping.nominal", mapping.nominal, law.nominal)
-        add("plant.mapping.ranges", mapping.ranges, law.ranges)
+        add("plant.mapping.ranges", mapping.ranges, ranges)
         if law.time_constant is not None:
             add("plant.mapping.time_constant", mapping.time_constant, law.time_constant)
         else:

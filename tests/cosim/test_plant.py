@@ -233,3 +233,25 @@ def test_bytes_that_are_no_plant_state_are_refused(plant):
     plant.reset(0)
     with pytest.raises(PlantError, match="not a serialised plant state"):
         plant.deserialise(b"cut")
+
+
+def with_one_law(scenario, law):
+    """The scenario as if its FMU had a single law, and no switch of the noise."""
+    mapping = {"law": None, "law_codes": {}, "stochastic": None}
+    return scenario.replace({"plant": {"mapping": mapping}, "disturbance": {"law": law}})
+
+
+def test_an_fmu_without_a_choice_of_laws_draws_by_its_ranges(paper):
+    with FmuPlant(paper) as plant, FmuPlant(with_one_law(paper, "uniform")) as single:
+        for each in (plant, single):
+            each.reset(5)
+        expected = plant.step(paper.reference_action)
+        found = single.step(paper.reference_action)
+    np.testing.assert_array_equal(found.disturbance, expected.disturbance)
+
+
+def test_an_fmu_without_a_switch_of_its_noise_is_undisturbed_by_ranges_of_zero(paper):
+    with FmuPlant(with_one_law(paper, "none")) as plant:
+        plant.reset(5)
+        step = plant.step(paper.reference_action)
+    np.testing.assert_array_equal(step.disturbance, paper.disturbance.nominal)

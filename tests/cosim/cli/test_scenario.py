@@ -1,10 +1,13 @@
 """`cosim scenario init`: what it drafts runs, and what it cannot guess it says."""
 
 import json
+import math
+import re
 
 import numpy as np
 import pytest
 
+import fmus
 from cosim import FmuPlant, Scenario
 from tests.helpers.kinds import REALS, build_kind
 from tests.helpers.tank import build_tank, edited
@@ -181,3 +184,28 @@ def test_a_draft_names_what_moves_nothing_and_what_nobody_drives(cosim, tmp_path
     assert code == 0, err
     assert "CHECK: no state moves by range" in out
     assert "CHECK: nobody drives u = 0" in out
+
+
+def test_a_draft_for_a_controller_needs_neither_a_law_nor_bounds(cosim, tmp_path):
+    """As many tools write FMUs: ranges of the noise are parameters, its law is no choice."""
+
+    def bare(text):
+        for name in ("law", "law_number", "stochastic"):
+            text = text.replace(f'name="{name}"', f'name="own_{name}"')
+        for name in ("cA", "T"):
+            limits = rf'(name="{name}"[^>]*>\s*<Real[^>]*?) min="[^"]*" max="[^"]*"'
+            text = re.sub(limits, r"\1", text)
+        return text
+
+    fmu = edited(fmus.path("reactor"), tmp_path / "bare.fmu", bare)
+    words = ("--model", "controllers.reactor:model", "--states", "cA,T", "--cost", "cost")
+    code, out, err = cosim("scenario", "init", fmu, *words, "--json")
+    assert code == 0, err
+    drafted = json.loads(out)
+    assert drafted["disturbance"]["law"] == "uniform"
+    assert all(map(math.isfinite, drafted["bounds"]["state_lower"]))
+    text = (tmp_path / "bare.toml").read_text()
+    assert "CHECK: the FMU does not bound cA, T on both sides" in text
+    assert "CHECK: the FMU has no choice of laws" in text
+    code, out, err = cosim("simulate", "-s", "bare.toml", "-n", 5, "--json")
+    assert code == 0, err

@@ -68,6 +68,15 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
         480,
         description="samples below which no back-off shrinks, under sensors",
     )
+    largest_bias: Positive = Field(
+        1.0,
+        description="mean of a sensor's innovations, in their expected deviations, above which no "
+        "noise explains the readings and θ stays",
+    )
+    least_biased_readings: Count = Field(
+        30,
+        description="readings of a sensor below which that mean is chance",
+    )
     # when an update is due
     first_update: Count = Field(30, description="samples before the first update of θ")
     longest_interval: Count = Field(

@@ -15,13 +15,14 @@ from typing import Any, ClassVar, NamedTuple
 import casadi as ca
 import numpy as np
 
-from controllers.errors import QpError
+from controllers.errors import ModelWarning, QpError
 from controllers.estimator import ExtendedKalmanFilter, OutputFeedback
 from controllers.factories import nmpc
 from controllers.functions import StackedFunction, define
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
+from cosim.core.errors import warn
 from cosim.core.protocols import Array, Vector
 from cosim.core.scenario import Scenario
 from cosim.core.sensors import Sensors
@@ -146,6 +147,20 @@ class ModelFromOutputs(Algorithm):
             settings.fit_noise_rounds,
         )
         parameters = self._filter.parameters
+        biased = self._biased_sensors(innovations)
+        if biased:
+            # The plant that is fitted has no such error: what it predicts is of another plant.
+            warn(
+                f"scenario '{self.scenario.name}': the readings of {', '.join(biased)} are off the "
+                "model's for good, which no noise explains, and θ stays: name the parameter that "
+                "may be wrong in the model's `uncertain`, or mend the model "
+                "(`cosim fmu check FMU --model MODEL`)",
+                ModelWarning,
+            )
+            self.predicted_cost = np.nan
+            theta = present.theta
+            update = update_without_fit(present.blocks, theta, theta, refused=True)
+            return update._replace(lost=True)
         base = self._base.replace({"noise": noise})
         base = _with_parameters(base, parameters)
         self._keep_errors(innovations)
@@ -176,6 +191,23 @@ class ModelFromOutputs(Algorithm):
         # A bound of θ beyond the true one has none.
         back_offs: Vector = np.maximum(np.concatenate([lower, upper]), 0.0)
         return back_offs
+
+    def _biased_sensors(self, innovations: Array) -> list[str]:
+        """Names of the sensors whose readings lie to one side of what the filter expects.
+
+        Args:
+            innovations: over their expected deviations, (M, n_y), NaN where there is no reading.
+        """
+        names = []
+        for i, sensor in enumerate(self.scenario.sensors or ()):
+            of_sensor = innovations[:, i]
+            arrived = of_sensor[~np.isnan(of_sensor)]
+            # Of few readings the mean is chance.
+            if len(arrived) < self.configuration.least_biased_readings:
+                continue
+            if abs(arrived.mean()) > self.configuration.largest_bias:
+                names.append(sensor.variable)
+        return names
 
     def _keep_errors(self, innovations: Array) -> None:
         """Keep those of the samples since the last update, as this fit has them."""

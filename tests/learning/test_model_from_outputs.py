@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from controllers import ExtendedKalmanFilter, RtiNmpc
-from controllers.errors import QpError
+from controllers.errors import ModelWarning, QpError
 from controllers.factories import tuned
 from controllers.problem import Problem
 from cosim import Scenario
@@ -213,6 +213,23 @@ def test_model_based_fits_the_filter_to_some_hours_of_readings():
     assert abs(UA2 - 5.2) < 0.5
     assert np.abs(learned["noise"] - training.start["noise"]).max() > 0.1
     assert training.updates == 2
+
+
+@pytest.mark.slow
+def test_readings_that_no_noise_explains_leave_theta_where_it_is():
+    """Without its uncertain parameter the model of `assay-fouled` is wrong for good."""
+    certain = Scenario.load("assay-fouled").replace({"estimator": {"parameter_drift": 0.0}})
+    with pytest.warns(ModelWarning, match=r"the readings of .*P2.* are off the model's for good"):
+        training = train(
+            "model-based",
+            certain,
+            240,
+            start="cautious",
+            seed=1,
+            settings={"fit_noise_rounds": 6, "simulated_samples": 600},
+            evaluation_seeds=0,
+        )
+    np.testing.assert_array_equal(training.learned.theta, training.start.theta)
 
 
 @pytest.mark.slow

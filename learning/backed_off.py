@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from controllers.errors import TuningError
 from controllers.estimator import EXPECTED_DISTURBANCE, measured
 from controllers.factories import nmpc, tuned
 from controllers.filter_model import measured_outputs
@@ -61,6 +62,9 @@ def back_off(
         deviation: guessed standard deviation of each disturbance, as a share of its magnitude;
             they are normal about this, new in each sample.
         samples: of the model that the search takes.
+
+    Raises:
+        TuningError: No sample of the simulation was solved.
     """
     # Nobody has trained for a signal; θ is what it moves from.
     scenario = scenario.still
@@ -75,6 +79,7 @@ def back_off(
     rng = np.random.default_rng(0)
     settings = BackOffConfiguration.from_dict({})
     search = BackOffSearch(start, scenario, samples, rng, settings)
+    n_solved = 0
     while not search.has_ended:
         controller.theta = search.trial.theta
         # A segment begins at the initial state; all of a round meet the same noise.
@@ -82,7 +87,9 @@ def back_off(
         segment_has_ended = False
         while not segment_has_ended:
             sample = loop.advance()
+            n_solved += sample.solution is not None
             segment_has_ended = search.observe(_transition(sample, scenario))
+    _require_a_solution(n_solved, scenario)
     _searched[key] = search.theta
     return search.theta
 
@@ -105,6 +112,9 @@ def add_reserve(
         deviation: guessed standard deviation of each disturbance, as a share of its magnitude.
         reserve: the back-off, in standard deviations of the one-step error.
         samples: of the simulation.
+
+    Raises:
+        TuningError: No sample of the simulation was solved.
     """
     scenario = scenario.still
     plant = GuessedPlant(scenario, deviation)
@@ -119,6 +129,7 @@ def add_reserve(
         transition = _transition(sample, scenario)
         if transition is not None:
             transitions.append(transition)
+    _require_a_solution(len(transitions), scenario)
     states = np.array([transition.s for transition in transitions])
     actions = np.array([transition.a for transition in transitions])
     next_states = np.array([transition.next_s for transition in transitions])
@@ -223,6 +234,16 @@ class GuessedPlant:
         # A sample's penalty is that of the state in which it begins.
         penalty = self.scenario.state_penalty(s.tolist())
         return Step(self._s, stage_cost, penalty, d, self.y)
+
+
+def _require_a_solution(n_solved: int, scenario: Scenario) -> None:
+    """Refuse a simulation of which no sample was solved: it says nothing of any back-off."""
+    if n_solved == 0:
+        raise TuningError(
+            f"scenario '{scenario.name}': no sample of the controller's own model was solved, so "
+            "that no back-off can be found; `cosim evaluate` of `tuned` counts the failures: look "
+            "at the model, its bounds and `cosim tuning` there"
+        )
 
 
 def _transition(sample: Sample, scenario: Scenario) -> Transition | None:

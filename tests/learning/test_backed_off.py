@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from controllers.economic import tune
+from controllers.errors import QpError, TuningError
 from controllers.factories import build_controller
 from controllers.rti import RtiNmpc
 from cosim.core.simulation import simulate
@@ -45,6 +46,17 @@ def test_a_training_starts_with_it(scenario, monkeypatch):
     start = run.starting_parameters()
     assert start["x_l"][0] > 25.0 and "w_sigma" in start.blocks
     assert np.array_equal(start.theta, run.starting_parameters().theta)
+
+
+@pytest.mark.parametrize("search", [back_off, add_reserve])
+def test_a_model_of_which_no_sample_is_solved_is_refused(scenario, tuned, monkeypatch, search):
+    def fail(self, s, a=None):
+        raise QpError("no", status="no")
+
+    monkeypatch.setattr(RtiNmpc, "feedback", fail)
+    with pytest.raises(TuningError, match=f"'{scenario.name}': no sample .* was solved"):
+        # Another noise than that of any other test: a search is kept.
+        search(tuned, scenario, deviation=0.07, samples=1000)
 
 
 def test_without_noise_nothing_is_backed_off(scenario, tuned):

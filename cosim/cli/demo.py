@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -16,6 +18,7 @@ from cosim.cli.evaluate import PairsOption, show_evaluation
 
 if TYPE_CHECKING:
     from controllers import RtiNmpc
+    from cosim.core.trajectory import RunSignals
     from learning.training import Training
 
 SCENARIO = "fouled"
@@ -47,9 +50,9 @@ def demo(
     trained. Two rules start from one of them, cautious, and learn on the plant. The last
     controller is the optimum, which knows the plant.
 
-    Writes evaluation.csv, evaluation.png, before-after.png, demo.rrd, timing.csv, scenario.toml and
-    summary.json. The folder of each rule holds its parameters.toml, learning.csv, learning.png and
-    training.rrd.
+    Writes evaluation.csv, evaluation.png, before-after.png, timing.csv, scenario.toml and
+    summary.json. The folder of each rule holds its parameters.toml, learning.csv and learning.png.
+    With the viewer of recordings installed it writes demo.rrd and each rule's training.rrd too.
 
     Args:
         samples: Plant samples of learning; default: a day.
@@ -61,7 +64,6 @@ def demo(
         from cosim.core.trajectory import RunSignals
         from cosim.figures.style import save
         from cosim.figures.trajectory import overlay_figure
-        from cosim.recording import record_overlay, record_training
 
         scenario = cosim.Scenario.load(SCENARIO)
         folder = cli.open_folder(out)
@@ -92,12 +94,12 @@ def demo(
         with staged(folder) as stage:
             evaluation.write_files(stage)
             save(overlay_figure(runs), stage / "before-after.png")
-            record_overlay(stage / "demo.rrd", signals, scenario.description)
             for name, training in trained.items():
-                files = stage / name
-                files.mkdir()
-                training.write_files(files)
-                record_training(files / "training.rrd", training)
+                (stage / name).mkdir()
+                training.write_files(stage / name)
+            has_viewer = find_spec("rerun") is not None
+            if has_viewer:
+                _record(stage, signals, scenario, trained)
             cli.write_summary(stage, summary)
         data = dict.fromkeys(UNTRAINED, "none")
         for name in LEARNING_RULES:
@@ -108,12 +110,36 @@ def demo(
             out_.note(_gain(summary, name, samples))
         # `make demo` activates no environment.
         command = "cosim" if shutil.which("cosim") else f"{sys.executable} -m cosim"
+        recording = f"{command} view {folder / 'demo.rrd'}"
+        if not has_viewer:
+            recording = "none without its viewer: pip install 'rti-cosim[view]'"
         out_.note(
             f"pictures   {folder / 'before-after.png'}, {folder / BEST / 'learning.png'}\n"
             f"learned θ  {folder / BEST / 'parameters.toml'} (a controller in every command)\n"
-            f"recording  {command} view {folder / 'demo.rrd'}"
+            f"recording  {recording}"
         )
         out_.json(summary)
+
+
+def _record(
+    folder: Path,
+    signals: Mapping[str, RunSignals],
+    scenario: cosim.Scenario,
+    trained: Mapping[str, Training],
+) -> None:
+    """Write the recordings of the runs and of each training.
+
+    Args:
+        folder: of the demo's files.
+        signals: of the runs, by controller.
+        scenario: of them all.
+        trained: training of each rule.
+    """
+    from cosim.recording import record_overlay, record_training
+
+    record_overlay(folder / "demo.rrd", signals, scenario.description)
+    for name, training in trained.items():
+        record_training(folder / name / "training.rrd", training)
 
 
 def _train_rules(start: str, samples: int, seed: int, output: cli.Output) -> dict[str, Training]:

@@ -209,6 +209,14 @@ def test_without_the_viewer_a_recording_says_what_to_install(installed, tmp_path
     assert "rti-cosim[view]" in result.stderr
 
 
+def test_without_the_viewer_the_demo_runs_and_records_nothing(installed, tmp_path):
+    env = bare_environment(installed)
+    words = ("demo", "--samples", "100", "--steps", "20", "--out", "demo", "--json")
+    run(installed, "-m", "cosim", *words, cwd=tmp_path, env=env)
+    assert (tmp_path / "demo" / "before-after.png").is_file()
+    assert not list((tmp_path / "demo").rglob("*.rrd"))
+
+
 def test_with_the_viewer_a_run_is_recorded(with_viewer, tmp_path):
     env = bare_environment(with_viewer)
     words = ("simulate", "--steps", "20", "--record", "--json", "--out", "run")

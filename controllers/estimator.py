@@ -13,6 +13,10 @@ derivatives are then the total ones, through the estimate:
 
 at the point where the QP was linearised (`controllers.estimator_sensitivities` has dx̂/dθ).
 
+θ may have a block `margin` κ, two entries a state. A bound is then tightened by κ deviations of the
+present estimate: x_l + κ_l √P_ii ≤ x_i ≤ x_u − κ_u √P_ii. So a back-off is small behind a reading
+and grows until the next one.
+
 Source: Anderson and Moore, Optimal Filtering, 1979, ch. 8.2 (extended filter), ch. 7.3 (the state
 augmented by delayed ones).
 """
@@ -55,6 +59,8 @@ DRIFT_PERIOD = 86400.0
 """Seconds in which an uncertain parameter changes by `parameter_drift`."""
 EXACT = 1e-6
 """Deviation of a sensor that is called exact, as a share of its variable's size: no rounding."""
+LARGEST_MARGIN = 0.25
+"""Share of the width between a state's bounds by which an estimate's deviation tightens one."""
 UNSEEN = 1e-8
 """Share of the largest singular value below which a direction counts as not observed."""
 
@@ -536,31 +542,93 @@ class ExtendedKalmanFilter:
             )
 
 
+@dataclass(frozen=True)
+class Margins:
+    """How an estimate's deviation tightens the bounds x_l, then x_u: by amounts t (2n,).
+
+    Attributes:
+        amounts: t.
+        by_margin: ∂t/∂κ of each one's own factor, (2n,); zero where t is limited.
+        by_noise: dt/dη, (q, 2n); of no rows where the filter does not differentiate.
+    """
+
+    amounts: Vector
+    by_margin: Vector
+    by_noise: Matrix
+
+    @classmethod
+    def from_filter(cls, estimator: ExtendedKalmanFilter, factors: Vector, most: Vector) -> Margins:
+        """Those of a filter's present estimate.
+
+        Args:
+            estimator: The filter.
+            factors: κ, (2n,).
+            most: Largest amounts, (2n,).
+        """
+        n = factors.size // 2
+        # Rounding may leave less than nothing of the variance of a state that is known.
+        variances = np.maximum(estimator.covariance.diagonal(), 0.0)
+        deviations = np.sqrt(variances)
+        wanted = factors * np.tile(deviations, 2)
+        is_limited = wanted > most
+        slopes = np.zeros((0, n))
+        if estimator.sensitivities is not None:
+            variance_slopes = estimator.sensitivities.covariance[:, range(n), range(n)]
+            # Of a state that is known exactly the deviation stays zero.
+            known = deviations == 0.0
+            slopes = variance_slopes / np.where(known, np.inf, 2.0 * deviations)
+        by_noise = factors * np.tile(slopes, 2)
+        return cls(
+            amounts=np.minimum(wanted, most),
+            by_margin=np.where(is_limited, 0.0, np.tile(deviations, 2)),
+            by_noise=np.where(is_limited, 0.0, by_noise),
+        )
+
+
 @dataclass(eq=False)
 class EstimatedSolution(RtiSolution):
     """A solution at an estimate: its derivatives by θ include those through the estimate.
 
     Attributes:
-        place: Of the block `noise` in θ.
-        by_noise: dx̂/dη, (q, n).
+        places: Of θ's blocks.
+        by_noise: dx̂/dη, (q, n); None where θ has no block `noise`.
+        margins: Of the bounds; None where θ has no block `margin`.
     """
 
-    place: slice = field(kw_only=True, repr=False)
-    by_noise: Matrix = field(kw_only=True, repr=False)
+    places: Mapping[str, slice] = field(kw_only=True, repr=False)
+    by_noise: Matrix | None = field(kw_only=True, repr=False)
+    margins: Margins | None = field(kw_only=True, repr=False)
 
     @cached_property
     def value_gradient(self) -> Vector:
-        """dV/dθ or dQ/dθ, shape (n_θ,), by `noise` dV/dx̂ · dx̂/dη."""
+        """dV/dθ or dQ/dθ, shape (n_θ,), through the estimate and its deviation too."""
         gradient = super().value_gradient.copy()
-        gradient[self.place] = self.by_noise @ self.costates[0]
+        if self.by_noise is not None:
+            gradient[self.places["noise"]] = self.by_noise @ self.costates[0]
+        self._add_margins(gradient[None])
         return gradient
 
     @property
     def policy_jacobian(self) -> Matrix:
-        """dπ/dθ, shape (m, n_θ), by `noise` dπ/dx̂ · dx̂/dη; as for an exact state otherwise."""
+        """dπ/dθ, shape (m, n_θ), through the estimate and its deviation too."""
         jacobian = super().policy_jacobian.copy()
-        jacobian[:, self.place] = self.policy_state_jacobian @ self.by_noise.T
+        if self.by_noise is not None:
+            jacobian[:, self.places["noise"]] = self.policy_state_jacobian @ self.by_noise.T
+        self._add_margins(jacobian)
         return jacobian
+
+    def _add_margins(self, derivatives: Matrix) -> None:
+        """Add what goes through the tightened bounds to derivatives by θ (rows, n_θ)."""
+        if self.margins is None:
+            return
+        places = self.places
+        # A margin raises x_l and lowers x_u.
+        by_lower = derivatives[:, places["x_l"]]
+        by_upper = derivatives[:, places["x_u"]]
+        by_amounts = np.concatenate([by_lower, -by_upper], axis=1)
+        derivatives[:, places["margin"]] = by_amounts * self.margins.by_margin
+        if self.by_noise is not None:
+            derivatives[:, places["noise"]] += by_amounts @ self.margins.by_noise.T
 
 
 class OutputFeedback:
@@ -570,14 +638,16 @@ class OutputFeedback:
     `feedback(y)` corrects the estimate, and feeds it back. Any other attribute is the controller's.
     Where θ has a block `noise` the estimator's variances are θ's, and the solutions' derivatives
     include those through the estimate. After θ has moved they are those of the trajectory as it
-    was, with the past at the θ that it had.
+    was, with the past at the θ that it had. Where θ has a block `margin` each feedback tightens the
+    controller's bounds by the present estimate's deviations.
 
     Args:
         estimator: Estimates the state.
         controller: Takes the estimate for the state.
 
     Raises:
-        ParameterError: The block `noise` of θ is of another estimator.
+        ParameterError: The block `noise` of θ is of another estimator, or θ has a block `margin`
+            and the estimator is no extended Kalman filter.
     """
 
     given = "measurement"
@@ -592,6 +662,14 @@ class OutputFeedback:
             _require_noise_of(estimator, parameters.blocks.block("noise").labels)
             self._noise_place = parameters.blocks.slices["noise"]
             self._set_noise()
+        self._most_margins: Vector | None = None
+        if isinstance(parameters, Parameters) and "margin" in parameters.blocks:
+            if not isinstance(estimator, ExtendedKalmanFilter):
+                raise ParameterError(
+                    "θ has a block margin, deviations of an extended Kalman filter's estimate: "
+                    "take estimator.kind 'ekf', or a θ without it"
+                )
+            self._most_margins = largest_margins(controller.problem)  # type: ignore[attr-defined]
         self._last_action: Vector | None = None
         self._known: Mapping[str, Vector] | None = None
         self._is_predicted = True
@@ -743,9 +821,10 @@ class OutputFeedback:
             self._is_corrected = True
         if self._failure is not None:
             raise self._failure
+        margins = self._tighten()
         solution = self.controller.feedback(estimate, a)
-        if self._noise_place is not None:
-            solution = self._differentiated(solution)
+        if self._noise_place is not None or margins is not None:
+            solution = self._differentiated(solution, margins)
         self._last_action = solution.action if a is None else a
         self._is_predicted = False
         return solution
@@ -757,11 +836,26 @@ class OutputFeedback:
             self._noise_of = self.theta
             self.estimator.noise = self.theta[self._noise_place]  # type: ignore[attr-defined]
 
-    def _differentiated(self, solution: Any) -> EstimatedSolution:
-        """A solution with the derivatives through the estimate."""
-        assert self._noise_place is not None
-        n = self.estimator.estimate.size
-        by_noise = self.estimator.sensitivities.states[:, 0, :n].copy()  # type: ignore[attr-defined]
+    def _tighten(self) -> Margins | None:
+        """Tighten the controller's bounds by the present estimate's deviations, if θ says so."""
+        if self._most_margins is None:
+            return None
+        controller: Any = self.controller
+        factors = controller.parameters["margin"]
+        estimator: Any = self.estimator
+        margins = Margins.from_filter(estimator, factors, self._most_margins)
+        lower, upper = np.split(margins.amounts, 2)
+        controller.tighten(lower, upper)
+        return margins
+
+    def _differentiated(self, solution: Any, margins: Margins | None) -> EstimatedSolution:
+        """A solution with the derivatives through the estimate and its deviations."""
+        by_noise = None
+        if self._noise_place is not None:
+            n = self.estimator.estimate.size
+            estimator: Any = self.estimator
+            by_noise = estimator.sensitivities.states[:, 0, :n].copy()
+        parameters: Parameters = self.controller.parameters  # type: ignore[attr-defined]
         return EstimatedSolution(
             action=solution.action,
             value=solution.value,
@@ -769,8 +863,9 @@ class OutputFeedback:
             memory=solution.memory,
             enforced=solution.enforced,
             status=solution.status,
-            place=self._noise_place,
+            places=parameters.blocks.slices,
             by_noise=by_noise,
+            margins=margins,
         )
 
     def applied(self, a: Vector) -> None:
@@ -791,6 +886,16 @@ def measured(scenario: Scenario, controller: Controller) -> Controller:
     if not scenario.sensors or table.kind == "none" or not takes_state:
         return controller
     return OutputFeedback.from_scenario(scenario, controller)
+
+
+def largest_margins(problem: Problem) -> Vector:
+    """Most that deviations tighten the lower, then the upper bounds by, (2n,): they never cross.
+
+    Args:
+        problem: The problem.
+    """
+    widths = problem.state_upper - problem.state_lower
+    return np.tile(LARGEST_MARGIN * widths, 2)
 
 
 def _require_noise_of(estimator: Estimator, labels: tuple[str, ...]) -> None:

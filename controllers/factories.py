@@ -59,6 +59,11 @@ def nmpc(
             f"θ has a block noise, variances of an estimator, and scenario '{scenario.name}' has "
             "no sensor: take a scenario with the sensors of this θ"
         )
+    if "margin" in parameters.blocks and (not scenario.sensors or kind != "rti"):
+        raise ParameterError(
+            "θ has a block margin, deviations of an estimate by which the RTI-NMPC tightens its "
+            "bounds: take a scenario with [[sensor]] and the controller rti"
+        )
     problem = Problem.from_scenario(scenario)
     settings = scenario.controller
     if kind == "converged":

@@ -175,6 +175,7 @@ class ThetaBlocks:
         *,
         slack_weights: bool = False,
         model_parameters: tuple[str, ...] = (),
+        margin: bool = False,
         noise: tuple[str, ...] = (),
     ) -> ThetaBlocks:
         """Blocks of the paper's θ for a problem (paper.tex, Simulations), and optional ones.
@@ -187,6 +188,7 @@ class ThetaBlocks:
             slack_weights: Whether to add the linear and quadratic slack weights w_sigma and W_sigma
                 of the predicted stages 1…N.
             model_parameters: Physical parameters of the model that are to be a block p, by name.
+            margin: Whether to add a block `margin` (`OutputFeedback`).
             noise: What the variances of a block `noise` are of (`ExtendedKalmanFilter`).
 
         Raises:
@@ -244,6 +246,8 @@ class ThetaBlocks:
                 labels=model_parameters,
             )
             blocks.append(parameters)
+        if margin:
+            blocks.append(margin_block(problem))
         if noise:
             blocks.append(noise_block(noise))
         return cls(tuple(blocks))
@@ -262,6 +266,42 @@ def noise_block(labels: tuple[str, ...]) -> ThetaBlock:
         meaning="log variances of the estimator",
         labels=labels,
     )
+
+
+def margin_block(problem: Problem) -> ThetaBlock:
+    """The block `margin`, (2n,): how many deviations of the estimate each bound is tightened by.
+
+    Args:
+        problem: Has the states, whose lower bounds come first.
+    """
+    names = [quantity.name for quantity in problem.model.states]
+    labels = []
+    for side in ("lower", "upper"):
+        labels += [f"{side} {name}" for name in names]
+    return ThetaBlock(
+        name="margin",
+        shape=(len(labels),),
+        scale=(1.0,) * len(labels),
+        meaning="deviations of the estimate by which a bound is tightened",
+        labels=tuple(labels),
+    )
+
+
+def add_margin(parameters: Parameters, problem: Problem) -> Parameters:
+    """θ with a block `margin` of zeros before `noise`; θ itself where it has one.
+
+    Args:
+        parameters: θ.
+        problem: Its problem.
+    """
+    if "margin" in parameters.blocks:
+        return parameters
+    others = list(parameters.blocks)
+    place = len(others) - ("noise" in parameters.blocks)
+    others.insert(place, margin_block(problem))
+    blocks = ThetaBlocks(tuple(others))
+    zero = Parameters(blocks, np.zeros(blocks.size))
+    return parameters.placed_in(zero)
 
 
 def _block(
@@ -484,11 +524,13 @@ class Parameters(Shown):
         values = file.theta
         # The file's keys say which optional blocks it has, so that it can be read without flags.
         slack_weights = "w_sigma" in values or "W_sigma" in values
+        margin = "margin" in values
         try:
             blocks = ThetaBlocks.from_problem(
                 problem,
                 slack_weights=slack_weights,
                 model_parameters=file.model_parameters,
+                margin=margin,
                 noise=file.noise,
             )
             missing = [name for name in blocks.slices if name not in values]

@@ -42,6 +42,10 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
     model_parameters: ModelParameters = ALL
     # under sensors (`learning.model_from_outputs`)
     noise: bool = Field(True, description="put the estimator's variances into θ, under sensors")
+    margin: bool = Field(
+        False,
+        description="put back-offs that follow the estimate's deviation into θ, under sensors",
+    )
     noise_prior: Positive = Field(
         0.5,
         description="standard deviation of the prior of these variances' logarithms",
@@ -63,6 +67,10 @@ class ModelBasedConfiguration(EmpiricalModelConfiguration):
         1.0,
         description="first step of a back-off in the search under sensors, in deviations of the "
         "predicted state; it is halved twice",
+    )
+    largest_margin: Positive = Field(
+        4.0,
+        description="most deviations of the estimate by which the search tightens a bound",
     )
     shrink_samples: Count = Field(
         480,

@@ -5,6 +5,9 @@ At each update the variances of the estimator's noises are fitted to the plant's
 Both make a plant: the controller's model at these parameters, with disturbances of these variances,
 behind the same sensors. On that plant, behind the same filter, back-offs are searched. A sample of
 it costs its stage cost at the estimate and the expectation of the next state's penalty.
+
+Where θ has a block `margin`, a part κ of a back-off follows the estimate's deviation σ. The search
+moves κ at the same mean back-off δ, whose constant part is δ − κσ̄ at the mean σ̄ of a rollout.
 """
 
 from __future__ import annotations
@@ -65,7 +68,8 @@ class ModelFromOutputs(Algorithm):
         true_bounds = {"x_l": problem.state_lower, "x_u": problem.state_upper}
         self._base = start.replace(true_bounds)
         self._distance = problem.state_upper - problem.state_lower
-        self._reserve = self._back_offs(start)
+        self._n_bounds = 2 * problem.n_states
+        self._reserve = self._back_offs(start, np.zeros(problem.n_states))[: self._n_bounds]
 
         # A ring of (y, a).
         sensors = self.scenario.sensors or ()
@@ -168,12 +172,14 @@ class ModelFromOutputs(Algorithm):
         self._plant.fit(self._filter, parameters, self._errors, seed)
 
         # The search begins at the present back-offs.
-        start = self._back_offs(present)
-        search = BackOffsBehindFilter(self._plant, base, self._distance, self._reserve, settings)
+        mean_deviation = self._mean_deviation(base, present)
+        start = self._back_offs(present, mean_deviation)
+        search = BackOffsBehindFilter(
+            self._plant, base, self._distance, self._reserve, mean_deviation, settings
+        )
         # Of few samples no back-off shrinks.
         may_shrink = self._n_rows >= settings.shrink_samples
-        least = np.zeros_like(start) if may_shrink else start
-        best = search.best(start, least)
+        best = search.best(start, may_shrink)
         cost = search.cost(best)
         self.predicted_cost = cost.mean
         # Where the best back-offs run away, too, the fitted plant says nothing of any θ.
@@ -184,13 +190,36 @@ class ModelFromOutputs(Algorithm):
         update = update_without_fit(present.blocks, present.theta, end, refused=lost)
         return update._replace(lost=lost)
 
-    def _back_offs(self, theta: Parameters) -> Vector:
-        """Those of the lower, then of the upper bounds, (2n,)."""
+    def _mean_deviation(self, base: Parameters, present: Parameters) -> Vector:
+        """What the filter is off in each state, in a rollout at the present bounds, (n,)."""
+        if "margin" not in present.blocks:
+            return np.zeros(self._n_bounds // 2)
+        bounds = {name: present[name] for name in ("x_l", "x_u", "margin")}
+        settings = self.configuration
+        cost = self._plant.run(
+            base.replace(bounds),
+            settings.simulated_samples,
+            settings.burn_in,
+        )
+        return cost.deviation
+
+    def _back_offs(self, theta: Parameters, mean_deviation: Vector) -> Vector:
+        """δ of the lower, then of the upper bounds, (2n,); behind them κ, where θ has a `margin`.
+
+        Args:
+            theta: θ.
+            mean_deviation: σ̄ of the estimate, (n,).
+        """
         lower = theta["x_l"] - self._base["x_l"]
         upper = self._base["x_u"] - theta["x_u"]
+        constant = np.concatenate([lower, upper])
         # A bound of θ beyond the true one has none.
-        back_offs: Vector = np.maximum(np.concatenate([lower, upper]), 0.0)
-        return back_offs
+        if "margin" not in theta.blocks:
+            back_offs: Vector = np.maximum(constant, 0.0)
+            return back_offs
+        factors = theta["margin"]
+        mean = constant + factors * np.tile(mean_deviation, 2)
+        return np.concatenate([np.maximum(mean, 0.0), factors])
 
     def _biased_sensors(self, innovations: Array) -> list[str]:
         """Names of the sensors whose readings lie to one side of what the filter expects.
@@ -431,11 +460,14 @@ class FittedPlant:
 class BackOffsBehindFilter:
     """Searches back-offs δ (2n,) of the lower, then the upper state bounds on a fitted plant.
 
+    Where θ has a block `margin`, κ (2n,) stands behind them: δ is then the mean back-off.
+
     Args:
         plant: the fitted plant.
         base: θ before its back-offs.
         distance: of the true bounds, (n,).
         reserve: back-offs of bounds that are not active, (2n,).
+        mean_deviation: σ̄ of the estimate, (n,).
         settings: of `model-based`.
     """
 
@@ -445,24 +477,35 @@ class BackOffsBehindFilter:
         base: Parameters,
         distance: Vector,
         reserve: Vector,
+        mean_deviation: Vector,
         settings: Any,
     ) -> None:
         self._plant = plant
         self._base = base
         self._settings = settings
         self._reserve = reserve
-        self._most = np.tile(settings.largest_back_off * distance, 2)
+        self._n_bounds = reserve.size
+        self._mean_deviations = np.tile(mean_deviation, 2)
+        most = settings.largest_back_off * distance
+        largest_factors = np.full(reserve.size, settings.largest_margin)
+        self._most = np.concatenate([most, most, largest_factors])
         self._known: dict[bytes, SimulatedCost] = {}
 
     def theta(self, delta: Vector) -> Parameters:
-        """θ with its bounds backed off by δ."""
+        """θ with its bounds backed off by δ, and with κ behind it."""
         base = self._base
-        below, above = np.split(delta, 2)
+        back_offs, factors = np.split(delta, [self._n_bounds])
+        others = {}
+        if factors.size:
+            others["margin"] = factors
+            # What does not follow the deviation; it may be less than nothing.
+            back_offs = back_offs - factors * self._mean_deviations
+        below, above = np.split(back_offs, 2)
         bounds = {
             "x_l": base["x_l"] + below,
             "x_u": base["x_u"] - above,
         }
-        return base.replace(bounds)
+        return base.replace(bounds | others)
 
     def cost(self, delta: Vector) -> SimulatedCost:
         """The rollout at δ; all meet the same noise."""
@@ -477,27 +520,42 @@ class BackOffsBehindFilter:
             )
         return self._known[key]
 
-    def best(self, delta: Vector, least: Vector) -> Vector:
-        """The cheapest δ that steps along the active bounds lead to.
+    def best(self, delta: Vector, may_shrink: bool) -> Vector:
+        """The cheapest δ, and κ behind it, that steps along the active bounds lead to.
 
         A bound is active where its penalty shows, or where it is backed off further than the
         reserve: that it costs nothing then may be the back-off's merit. Others keep theirs.
 
         Args:
-            delta: present δ, (2n,).
-            least: least δ, (2n,).
+            delta: present δ, (2n,) or, with κ, (4n,).
+            may_shrink: whether a back-off may be less than it is, at any sample.
         """
         step = self._settings.back_off_step
+        least = np.zeros_like(delta) if may_shrink else delta
         # A sweep that finds the place, and one that settles it.
         coarse = (step, step / 2)
         fine = (step / 4,)
         for steps in (coarse, fine):
             cost = self.cost(delta)
             shows = self._settings.least_penalty_share * abs(cost.mean)
-            active = np.flatnonzero((cost.penalties > shows) | (delta > self._reserve))
+            is_backed_off = delta[: self._n_bounds] > self._reserve
+            active = np.flatnonzero((cost.penalties > shows) | is_backed_off)
             for i in active.tolist():
                 delta = self._along(delta, i, least[i], steps)
+                factor = self._n_bounds + i
+                # At a larger κ the back-off behind a reading is less.
+                if may_shrink and factor < delta.size:
+                    delta = self._along(delta, factor, 0.0, steps)
         return delta
+
+    def _unit(self, delta: Vector, i: int) -> float:
+        """What steps of entry i are counted in."""
+        # κ has no unit.
+        if i >= self._n_bounds:
+            return 1.0
+        # What the filter is off in that state, which has two bounds.
+        deviation = self.cost(delta).deviation
+        return float(deviation[i % deviation.size])
 
     def _along(
         self,
@@ -506,10 +564,8 @@ class BackOffsBehindFilter:
         least: float,
         steps: Sequence[float],
     ) -> Vector:
-        """The cheapest δ by steps of one back-off, taken until none is cheaper."""
-        # In units of what the filter is off in that state, which has two bounds.
-        deviation = self.cost(delta).deviation
-        unit = float(deviation[i % deviation.size])
+        """The cheapest δ by steps of one entry, taken until none is cheaper."""
+        unit = self._unit(delta, i)
         most = self._most[i]
         while True:
             points = [delta]

@@ -149,6 +149,10 @@ class QLearningConfiguration(ValueConfiguration):
         False,
         description="put the estimator's variances into θ, under sensors",
     )
+    margin: bool = Field(
+        False,
+        description="put back-offs that follow the estimate's deviation into θ, under sensors",
+    )
     prior_samples: Count = Field(
         500,
         description="samples of the warm-up, without updates; they give noise and prior widths",
@@ -279,6 +283,9 @@ def prior_deviation(
             widths[name] = width * np.abs(start[name])
     if "noise" in start.blocks:
         widths["noise"] = np.full(start["noise"].size, settings.noise_width)
+    if "margin" in start.blocks:
+        # Counted in deviations already.
+        widths["margin"] = np.full(start["margin"].size, relative_width)
     packed = [block.pack(widths[block.name]) for block in start.blocks]
     # An entry of no width would divide by zero where θ is scaled.
     floor = np.finfo(np.float64).tiny ** 0.25

@@ -16,7 +16,7 @@ from controllers.economic import tune
 from controllers.estimator import ExtendedKalmanFilter
 from controllers.factories import nmpc
 from controllers.problem import Problem, given_parameters
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks, add_margin
 from cosim.core.protocols import Vector
 from cosim.core.scenario import EstimatorTable, Scenario
 from cosim.core.sensors import require_readings
@@ -132,16 +132,23 @@ class TrainingRun(TrainingOptions):
         """θ where the run starts; raises what the function `starting_parameters` raises."""
         start = self._starting_parameters()
         table = self.scenario.estimator or EstimatorTable()
-        learns_noise = getattr(self.configuration, "noise", False)
         has_filter = bool(self.scenario.sensors) and table.kind == "ekf"
-        # Variances without a filter that reads them would be entries of θ without an effect.
-        if not learns_noise or not has_filter:
-            return start
-        estimator = ExtendedKalmanFilter.from_scenario(self.scenario)
-        return estimator.add_noise(start)
+        # Without a filter that reads them these would be entries of θ without an effect.
+        if has_filter and getattr(self.configuration, "noise", False):
+            estimator = ExtendedKalmanFilter.from_scenario(self.scenario)
+            start = estimator.add_noise(start)
+        if has_filter and getattr(self.configuration, "margin", False):
+            start = add_margin(start, Problem.from_scenario(self.scenario))
+        # A replay has the state and not how far off it was.
+        if "margin" in start.blocks and load_algorithm(self.algorithm).needs_points:
+            raise ConfigurationError(
+                f"{self.algorithm} replays transitions, which do not say by how much the block "
+                "margin of θ tightened the bounds: take another rule or a θ without it"
+            )
+        return start
 
     def _starting_parameters(self) -> Parameters:
-        """The same without a block `noise`, but for that of a file."""
+        """The same without the blocks `noise` and `margin`, but for those of a file."""
         problem = Problem.from_scenario(self.scenario)
         if self.start not in ("backed-off", "cautious"):
             return starting_parameters(problem, self.configuration, self.start)
@@ -457,6 +464,7 @@ def starting_parameters(
         problem,
         slack_weights=configuration.parametrisation == "extended",
         model_parameters=tuple(labels),
+        margin=file is not None and "margin" in file.blocks,
         noise=noise,
     )
     # What a file does not say begins as with `naive`.

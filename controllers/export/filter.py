@@ -17,13 +17,21 @@ from controllers.functions import not_in_c, work_sizes
 from cosim.core.protocols import Vector
 
 
-def estimated_state(model: FilterModel, variances: Vector, *, in_theta: bool) -> Observer:
+def estimated_state(
+    model: FilterModel,
+    variances: Vector,
+    *,
+    in_theta: bool,
+    most_margins: Vector | None = None,
+) -> Observer:
     """The state of an exported controller as a filter estimates it.
 
     Args:
         model: What the filter computes with.
         variances: Of its disturbances, drifts and sensors, (q,).
         in_theta: Whether θ has them, in the block `noise`.
+        most_margins: Most that each state's bounds are tightened by, (n,); None where θ has no
+            block `margin`.
 
     Raises:
         ControllerError: The model calls what cannot be C.
@@ -37,7 +45,12 @@ def estimated_state(model: FilterModel, variances: Vector, *, in_theta: bool) ->
     n_all = model.n_kept * model.start.size
     return Observer(
         rule="state_estimated.h",
-        sources=filter_sources(model, variances=variances, in_theta=in_theta),
+        sources=filter_sources(
+            model,
+            variances=variances,
+            in_theta=in_theta,
+            most_margins=most_margins,
+        ),
         # Before a sample's readings and behind them.
         memory=2 * (model.n_noises + max(len(model.signals), 1) + n_all + n_all**2),
         readings=model.variables,
@@ -51,6 +64,7 @@ def filter_sources(
     differentiates: bool = False,
     variances: Vector | None = None,
     in_theta: bool = False,
+    most_margins: Vector | None = None,
 ) -> dict[str, bytes]:
     """C files of a filter; `filter.h` is what to include.
 
@@ -59,6 +73,7 @@ def filter_sources(
         differentiates: Whether its derivatives by its variances are among them.
         variances: Those that it starts with, (q,); None where another says them.
         in_theta: Whether θ says them at each sample.
+        most_margins: As `estimated_state` takes them.
 
     Returns:
         Contents by file name, the same bytes for the same model.
@@ -96,6 +111,8 @@ def filter_sources(
     }
     if variances is not None:
         arrays["FILTER_VARIANCES"] = variances
+    if most_margins is not None:
+        arrays["FILTER_MOST_MARGIN"] = most_margins
     functions = [definition.function for definition in definitions.values()]
     header = filled(
         "filter_model.h.in",
@@ -104,6 +121,7 @@ def filter_sources(
         arrays="\n".join(array_text(name, values) for name, values in arrays.items()),
         rows=", ".join(map(str, signal_rows or [0])),
         in_theta=str(int(in_theta)),
+        margin=str(int(most_margins is not None)),
         functions=static_functions("filter", functions).decode(),
     )
     sources = {"filter_model.h": header.encode()}

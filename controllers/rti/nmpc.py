@@ -930,6 +930,26 @@ class RtiNmpc:
         # The last preparation is of other values.
         self._prepared = None
 
+    def tighten(self, lower: Vector, upper: Vector) -> None:
+        """Move the bounds of the predicted states inwards for the feedbacks that follow.
+
+        It holds until the next call, until θ is set, or until a reset. Bounds belong to the
+        feedback phase: the preparation stays.
+
+        Args:
+            lower: By how much each lower bound rises, (n,).
+            upper: By how much each upper bound falls, (n,).
+        """
+        parameters = self._parameters
+        places = parameters.blocks.slices
+        memories = [self._prepare.inputs["theta"]]
+        if self._prepared is not None:
+            # The solution's derivatives are computed from this copy.
+            memories.append(self._prepared.part("theta"))
+        for theta in memories:
+            theta[places["x_l"]] = parameters["x_l"] + lower
+            theta[places["x_u"]] = parameters["x_u"] - upper
+
     # the two phases -----------------------------------------------------------------------------
 
     def reset(self) -> None:
@@ -1210,7 +1230,9 @@ class RtiNmpc:
         n = problem.n_states
         width = n + problem.n_actions
         part = self._prepare.part
-        parameters = self._parameters
+        # Not θ's own: they may be tightened.
+        theta = self._prepare.inputs["theta"]
+        places = self._parameters.blocks.slices
         x_s = problem.reference_state
         state_scale = problem.scale.state
         return Stages(
@@ -1223,8 +1245,8 @@ class RtiNmpc:
             q_N=part("q_N"),
             lower=self._qp.lower,
             upper=self._qp.upper,
-            state_lower=(parameters["x_l"] - x_s) / state_scale,
-            state_upper=(parameters["x_u"] - x_s) / state_scale,
+            state_lower=(theta[places["x_l"]] - x_s) / state_scale,
+            state_upper=(theta[places["x_u"]] - x_s) / state_scale,
             w=self._qp.w,
             W=self._qp.W,
         )

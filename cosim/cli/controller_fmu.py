@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from controllers import ExtendedKalmanFilter, OutputFeedback, Parameters, Problem, RtiNmpc
+from controllers.estimator import largest_margins
 from controllers.export import STATUSES, Observer, core, estimated_state, plain_c
 from controllers.factories import build_controller
 from controllers.filter_model import measured_outputs
@@ -100,8 +101,16 @@ def observer_of(controller: RtiNmpc, scenario: Scenario) -> Observer | None:
     assert isinstance(estimator, ExtendedKalmanFilter)
     # The filter has the logarithms of its variances.
     variances = np.exp(estimator.noise)
-    in_theta = "noise" in controller.parameters.blocks
-    return estimated_state(estimator.model, variances, in_theta=in_theta)
+    blocks = controller.parameters.blocks
+    most_margins = None
+    if "margin" in blocks:
+        most_margins = largest_margins(controller.problem)[: controller.problem.n_states]
+    return estimated_state(
+        estimator.model,
+        variances,
+        in_theta="noise" in blocks,
+        most_margins=most_margins,
+    )
 
 
 def sampled_controller(

@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controllers import ControllerError, ExtendedKalmanFilter, Model, OutputFeedback, Quantity
-from controllers.errors import ModelError, QpError
-from controllers.factories import build_controller
+from controllers.errors import ModelError, ParameterError, QpError
+from controllers.factories import build_controller, naive, nmpc
 from controllers.filter_model import INITIAL_DEVIATION
 from controllers.model import discretise
 from controllers.problem import Problem, Varying
+from controllers.theta import add_margin
 from cosim import FmuPlant, Scenario, simulate
 from cosim.core.protocols import Decision
 from cosim.core.scenario import SensorTable
@@ -332,3 +333,66 @@ def test_readings_are_taken_up_where_the_preparation_fails():
         alone.correct(y)
         assert np.array_equal(law.estimate, alone.estimate)
         law.applied(np.array([0.25]))
+
+
+def with_margin(scenario, factors):
+    """The naive controller with a block `margin`, behind the scenario's filter."""
+    parameters = naive(scenario).parameters
+    parameters = add_margin(parameters, Problem.from_scenario(scenario))
+    controller = nmpc(scenario, parameters.replace({"margin": factors}))
+    return OutputFeedback.from_scenario(scenario, controller)
+
+
+def test_a_margin_is_the_same_as_bounds_moved_by_deviations_of_the_estimate():
+    """Small behind a reading, then growing; at each sample the plain QP with those bounds."""
+    scenario = Scenario.load("assay")
+    factors = np.array([1.8, 0.0, 0.0, 0.5])
+    law = with_margin(scenario, factors)
+    plain = naive(scenario)
+    start = plain.parameters
+    deviations = []
+    law.reset()
+    for k in range(20):
+        y = np.array([26.0 if k % 15 == 0 else np.nan, 50.0])
+        law.prepare()
+        point = law.linearisation_point
+        ours = law.feedback(y)
+        deviation = np.sqrt(np.maximum(law.estimator.covariance.diagonal(), 0.0))
+        lower = start["x_l"] + factors[:2] * deviation
+        upper = start["x_u"] - factors[2:] * deviation
+        plain.parameters = start.replace({"x_l": lower, "x_u": upper})
+        plain.prepare_at(point)
+        theirs = plain.feedback(law.estimate)
+        assert ours.value == pytest.approx(theirs.value, rel=1e-12)
+        np.testing.assert_allclose(ours.action, theirs.action, rtol=0, atol=1e-10)
+        deviations.append(deviation[0])
+    # X2 is read exactly at the samples 0 and 15, and less and less known in between.
+    assert deviations[0] < 1e-3 and deviations[15] < 1e-3
+    assert np.all(np.diff(deviations[:15]) > 0.0)
+    assert deviations[14] > 1.0
+
+
+def test_margins_leave_bounds_that_do_not_cross():
+    """However far the estimate is off, each gives way by a quarter of the width at most."""
+    scenario = Scenario.load("assay")
+    law = with_margin(scenario, np.full(4, 1e6))
+    law.reset()
+    law.prepare()
+    solution = law.feedback([np.nan, np.nan])
+    widths = scenario.state_upper - scenario.state_lower
+    place = law.parameters.blocks.slices["x_l"]
+    found = solution.prepared.part("theta")[place]
+    np.testing.assert_allclose(found, scenario.state_lower + widths / 4, rtol=1e-14)
+    # What is limited follows no factor.
+    assert not solution.value_gradient[law.parameters.blocks.slices["margin"]].any()
+
+
+def test_a_margin_is_refused_where_nothing_says_how_far_the_estimate_is_off():
+    scenario = Scenario.load("assay")
+    law = with_margin(scenario, np.zeros(4))
+    parameters = law.parameters
+    with pytest.raises(ParameterError, match="extended Kalman filter"):
+        OutputFeedback(Recorded(), law.controller)
+    for other, kind in ((Scenario.load("paper"), "rti"), (scenario, "converged")):
+        with pytest.raises(ParameterError, match=r"\[\[sensor\]\] and the controller rti"):
+            nmpc(other, parameters, kind)

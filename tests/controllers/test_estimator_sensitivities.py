@@ -10,17 +10,25 @@ from controllers.errors import ParameterError
 from controllers.factories import naive, nmpc
 from controllers.model import discretise
 from controllers.problem import Problem
+from controllers.theta import add_margin
 from cosim import Scenario
 from cosim.core.scenario import SensorTable
+from tests.helpers.compiler import needs_compiler
 
 SAMPLES = 12
 
 
-def with_noise(scenario):
-    """A naive controller whose θ has the block `noise`, behind the scenario's filter."""
+def with_noise(scenario, margin=None):
+    """A naive controller whose θ has a block `noise`, behind the scenario's filter.
+
+    With `margin` (2n,) that block, too.
+    """
     estimator = ExtendedKalmanFilter.from_scenario(scenario)
-    controller = nmpc(scenario, estimator.add_noise(naive(scenario).parameters))
-    return OutputFeedback.from_scenario(scenario, controller)
+    parameters = estimator.add_noise(naive(scenario).parameters)
+    if margin is not None:
+        parameters = add_margin(parameters, Problem.from_scenario(scenario))
+        parameters = parameters.replace({"margin": margin})
+    return OutputFeedback.from_scenario(scenario, nmpc(scenario, parameters))
 
 
 def readings_of(sensors, values, rng):
@@ -76,12 +84,24 @@ def late_and_slow():
     return scenario.replace({"sensor": table})
 
 
-def test_v_q_and_policy_are_differentiated_through_the_estimate():
+@pytest.mark.parametrize(
+    ("margin", "x_l", "functions"),
+    [
+        (None, [25.8, 40.0], "interpreted"),
+        # Two bounds that are tightened to where the first of them is active.
+        ([0.9, 0.4, 0.2, 0.3], [25.0, 40.0], "interpreted"),
+        pytest.param([0.9, 0.4, 0.2, 0.3], [25.0, 40.0], "compiled", marks=needs_compiler),
+    ],
+)
+def test_v_q_and_policy_are_differentiated_through_the_estimate(margin, x_l, functions):
     """All of it anew at each perturbed θ: the same readings and actions, the same last point."""
     rng = np.random.default_rng(3)
     scenario = late_and_slow()
-    law = with_noise(scenario)
-    theta = law.controller.parameters.replace({"x_l": [25.8, 40.0]}).theta
+    law = with_noise(scenario, margin)
+    if functions == "compiled":
+        law.compile()
+    assert law.functions == functions
+    theta = law.controller.parameters.replace({"x_l": x_l}).theta
     readings = readings_of(scenario.sensors, [25.5, 50.0], rng)
     reference = law.problem.reference_action
     actions = reference + rng.normal(0.0, 8.0, (SAMPLES, 2))
@@ -94,11 +114,15 @@ def test_v_q_and_policy_are_differentiated_through_the_estimate():
         v, q, _ = solutions_at(law, perturbed, readings, actions, point)
         return np.array([v.value, q.value, *v.action])
 
-    place = law.controller.parameters.blocks.slices["noise"]
+    blocks = law.controller.parameters.blocks
+    # The last blocks, what goes through the estimate; and the bounds that a margin tightens.
+    place = slice(blocks.slices["x_l"].start, blocks.size)
     ours = np.vstack([value.value_gradient, action_value.value_gradient, value.policy_jacobian])
     columns = []
     for i in range(place.start, place.stop):
-        columns.append(central_difference(results, theta, i))
+        # A bound that moves as far as a logarithm may meet another constraint.
+        step = 2e-2 if i >= blocks.slices["noise"].start else 2e-3
+        columns.append(central_difference(results, theta, i, step))
     theirs = np.column_stack(columns)
     for our, their in zip(ours[:, place], theirs, strict=True):
         assert np.allclose(our, their, rtol=1e-6, atol=1e-6 * np.abs(their).max())

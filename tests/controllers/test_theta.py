@@ -37,6 +37,7 @@ BLOCKS = {
     "paper": {},
     "extended": {"slack_weights": True},
     "physical": {"slack_weights": True, "model_parameters": ("UA2", "h")},
+    "estimated": {"model_parameters": ("UA2",), "margin": True, "noise": ("a", "b")},
 }
 
 

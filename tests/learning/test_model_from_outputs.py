@@ -11,9 +11,11 @@ from controllers import ExtendedKalmanFilter, RtiNmpc
 from controllers.errors import ModelWarning, QpError
 from controllers.factories import tuned
 from controllers.problem import Problem
+from controllers.theta import add_margin
 from cosim import Scenario
 from cosim.core.scenario import Penalty
 from cosim.core.sensors import Sensors
+from cosim.core.training_options import TrainingOptions
 from learning import train
 from learning.errors import ConfigurationError
 from learning.gaussian_penalty import expected_penalties_with_errors, normal_penalties
@@ -139,11 +141,37 @@ def test_a_back_off_that_went_too_far_comes_down_to_what_is_cheapest():
     settings = ModelBasedConfiguration.from_dict({})
     reserve = np.array([4.0, 2.0, 18.0, 2.0])
     base = tuned(scenario).parameters
-    search = BackOffsBehindFilter(Bowl(), base, np.full(2, 50.0), reserve, settings)
+    search = BackOffsBehindFilter(Bowl(), base, np.full(2, 50.0), reserve, np.zeros(2), settings)
     start = reserve + np.array([26.0, 0.0, 0.0, 0.0])
-    best = search.best(start, np.zeros(4))
+    best = search.best(start, may_shrink=True)
     assert best[0] == pytest.approx(5.0, abs=settings.back_off_step)
     assert np.array_equal(best[1:], reserve[1:])
+
+
+class Valley:
+    """A stand-in whose cost is least at δ = 5 and κ = 2 about a deviation of 1.5."""
+
+    def run(self, theta, n_samples, burn_in):
+        factor = theta["margin"][0]
+        back_off = theta["x_l"][0] - 25.0 + 1.5 * factor
+        cost = 100.0 + (back_off - 5.0) ** 2 + (factor - 2.0) ** 2
+        return SimulatedCost(cost, np.array([1.0, 0.0, 0.0, 0.0]), np.ones(2))
+
+
+@pytest.mark.parametrize(("may_shrink", "factor"), [(True, 2.0), (False, 0.0)])
+def test_a_search_moves_what_follows_the_deviation_at_the_same_mean(may_shrink, factor):
+    scenario = Scenario.load("assay")
+    settings = ModelBasedConfiguration.from_dict({})
+    base = add_margin(tuned(scenario).parameters, Problem.from_scenario(scenario))
+    mean_deviation = np.array([1.5, 0.5])
+    search = BackOffsBehindFilter(
+        Valley(), base, np.full(2, 50.0), np.full(4, 1.0), mean_deviation, settings
+    )
+    best = search.best(np.array([3.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), may_shrink)
+    np.testing.assert_allclose(best, [5.0, 1.0, 1.0, 1.0, factor, 0.0, 0.0, 0.0])
+    theta = search.theta(best)
+    assert theta["x_l"][0] == 25.0 + 5.0 - 1.5 * factor
+    assert theta["margin"][0] == factor
 
 
 class RunsAway:
@@ -237,7 +265,10 @@ def test_readings_that_no_noise_explains_leave_theta_where_it_is():
     ("algorithm", "settings"),
     [
         ("model-based", {"fit_noise_rounds": 2, "simulated_samples": 310, "least_samples": 30}),
-        ("q-learning", {"noise": True, "prior_samples": 20, "step_every": 10}),
+        (
+            "q-learning",
+            {"noise": True, "margin": True, "prior_samples": 20, "step_every": 10},
+        ),
     ],
 )
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(algorithm, settings, tmp_path):
@@ -263,6 +294,35 @@ def test_the_block_is_where_sensors_are():
         blocks[name] = run.starting_parameters().blocks
     assert "noise" not in blocks["paper"]
     assert blocks["assay"].block("noise").labels[-1] == "sensor P2"
+
+
+def test_a_margin_is_an_entry_of_theta_where_it_is_asked_for():
+    """It begins at zero, before `noise`; a file's stays; rules that replay refuse it."""
+    scenario = Scenario.load("assay")
+    for settings, expected in (({}, False), ({"margin": True}, True)):
+        run = make_run("model-based", scenario, 60, settings)
+        start = run.starting_parameters()
+        assert ("margin" in start.blocks) is expected
+    assert [block.name for block in start.blocks][-2:] == ["margin", "noise"]
+    assert not start["margin"].any()
+    assert (
+        "margin"
+        not in make_run("model-based", Scenario.load("paper"), 60, {"margin": True})
+        .starting_parameters()
+        .blocks
+    )
+
+
+def test_a_margin_of_a_file_is_kept_and_rules_that_replay_refuse_it(tmp_path):
+    scenario = Scenario.load("assay")
+    parameters = add_margin(tuned(scenario).parameters, Problem.from_scenario(scenario))
+    parameters = parameters.replace({"margin": [1.8, 0.0, 0.0, 0.0]})
+    file = str(parameters.save(tmp_path / "theta.toml"))
+    options = TrainingOptions(start=file)
+    kept = make_run("actor-critic", scenario, 60, options=options).starting_parameters()
+    assert kept["margin"][0] == 1.8
+    with pytest.raises(ConfigurationError, match="batch-q-learning replays"):
+        make_run("batch-q-learning", scenario, 60, options=options).starting_parameters()
 
 
 def test_a_rollout_whose_preparation_fails_costs_infinitely_much(monkeypatch):

@@ -78,8 +78,8 @@ static QP_APART int core_solve(const RtiPrepared *prepared, RtiSolved *solved, c
 
 /* V(s) and π(s) of the QP at the guess, or Q(s, a) where `a` is given; anything but RTI_SOLVED leaves
  * `solution` alone. */
-static int core_sample(const CoreGuess *guess, const double theta[], const double s[],
-                       const double a[], CoreSolution *solution) {
+static int core_sample(const CoreGuess *guess, const double theta[], const Observer *observer,
+                       const double s[], const double a[], CoreSolution *solution) {
     QP_SCRATCH RtiPrepared prepared;
     QP_SCRATCH RtiSolved solved;
     if (!well_posed(theta)) return RTI_ILL_POSED;
@@ -88,6 +88,7 @@ static int core_sample(const CoreGuess *guess, const double theta[], const doubl
     memcpy(prepared.u, guess->u, sizeof prepared.u);
     memcpy(prepared.costates, guess->costates, sizeof prepared.costates);
     memcpy(prepared.theta, theta, sizeof prepared.theta);
+    observer_tighten(observer, prepared.theta);
     memcpy(solved.s, s, sizeof solved.s);
     int status = rti_prepare(&prepared);
     if (status != RTI_SOLVED) return status;
@@ -124,7 +125,8 @@ static void core_act(CoreState *state, const double inputs[], const double manua
     for (int i = 0; i < N_U; i++)
         a[i] = manual && isfinite(manual[i]) ? qp_clip(manual[i], ACTION_LOWER[i], ACTION_UPPER[i])
                                              : state->applied[i];
-    state->status = core_sample(&state->guess, theta, s, manual ? a : 0, &state->solution);
+    state->status = core_sample(&state->guess, theta, &state->observer, s, manual ? a : 0,
+                                &state->solution);
     for (int i = 0; !manual && state->status == RTI_SOLVED && i < N_U; i++)
         a[i] = qp_clip(state->solution.u[0][i], ACTION_LOWER[i], ACTION_UPPER[i]);
     memcpy(state->action, a, sizeof a);

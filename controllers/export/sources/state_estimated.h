@@ -40,6 +40,21 @@ static inline const double *observer_take(Observer *observer, const double input
     return filter->z[0];
 }
 
+/* Tighten the bounds in θ by deviations of the present estimate, as `controllers.estimator.Margins`. */
+static inline void observer_tighten(const Observer *observer, double theta[]) {
+    (void)observer, (void)theta;
+#if FILTER_MARGIN
+    for (int i = 0; i < N_X; i++) {
+        /* Rounding may leave less than nothing of the variance of a state that is known. */
+        const double variance = observer->corrected.covariance[i][i];
+        const double deviation = sqrt(variance > 0.0 ? variance : 0.0);
+        const double *const factors = theta + THETA_margin;
+        theta[THETA_x_l + i] += fmin(factors[i] * deviation, FILTER_MOST_MARGIN[i]);
+        theta[THETA_x_u + i] -= fmin(factors[N_X + i] * deviation, FILTER_MOST_MARGIN[i]);
+    }
+#endif
+}
+
 static inline int observer_plausible(const Observer *observer) {
     return all_finite(&observer->before.z[0][0], FILTER_ALL) &&
            all_finite(&observer->before.covariance[0][0], FILTER_ALL * FILTER_ALL) &&

@@ -18,6 +18,11 @@ static inline const double *observer_take(Observer *observer, const double input
     return observer->s;
 }
 
+/* A state that is known tightens no bound. */
+static inline void observer_tighten(const Observer *observer, double theta[]) {
+    (void)observer, (void)theta;
+}
+
 /* The sample ends with an action. */
 static inline void observer_commit(Observer *observer, const double action[]) {
     (void)observer, (void)action;

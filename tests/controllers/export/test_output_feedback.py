@@ -8,6 +8,8 @@ import pytest
 
 from controllers import ExtendedKalmanFilter, OutputFeedback
 from controllers.factories import nmpc, tuned
+from controllers.problem import Problem
+from controllers.theta import add_margin
 from cosim import FmuPlant, Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_c
 from cosim.core.errors import CosimError
@@ -42,6 +44,14 @@ def with_noise(scenario):
     estimator = ExtendedKalmanFilter.from_scenario(scenario)
     estimator.noise = estimator.noise + np.linspace(-1.0, 1.0, estimator.noise.size)
     return nmpc(scenario, estimator.add_noise(tuned(scenario).parameters))
+
+
+def with_margin(scenario):
+    """The same whose bounds follow the estimate's deviation; one of them as far as they may."""
+    parameters = with_noise(scenario).parameters
+    parameters = add_margin(parameters, Problem.from_scenario(scenario))
+    # No deviation is as small as a hundredth of the width that the last factor makes the limit.
+    return nmpc(scenario, parameters.replace({"margin": [1.8, 0.4, 0.3, 100.0]}))
 
 
 def closed_loop(scenario, controller, samples):
@@ -79,6 +89,8 @@ def printed(program, readings):
     ("changes", "make", "samples"),
     [
         (SHORT | LATE | {"signal": [FEED]}, with_noise, 100),
+        (SHORT, with_margin, 100),
+        pytest.param(SHORT | LATE, with_margin, 500, marks=pytest.mark.slow),
         pytest.param({}, tuned, 500, marks=pytest.mark.slow),
         pytest.param(SHORT | LATE, with_noise, 500, marks=pytest.mark.slow),
     ],
@@ -97,11 +109,11 @@ def test_plain_c_gives_the_actions_of_the_python_controller(tmp_path, changes, m
 @needs_compiler
 @pytest.mark.usefixtures("quickly_built")
 @pytest.mark.slow
-@pytest.mark.parametrize("version", [2, 3])
-def test_the_fmu_gives_them_and_goes_on_from_its_bytes(tmp_path, version):
+@pytest.mark.parametrize(("version", "make"), [(2, with_noise), (3, with_margin)])
+def test_the_fmu_gives_them_and_goes_on_from_its_bytes(tmp_path, version, make):
     """Actions and estimates of both; a second instance from bytes in the middle has the same."""
     scenario = Scenario.load("assay").replace(SHORT | LATE)
-    controller = with_noise(scenario)
+    controller = make(scenario)
     samples = 40
     readings, actions, estimates = closed_loop(scenario, controller, samples)
     system = sampled_controller(controller, scenario)

@@ -224,7 +224,8 @@ class EstimatorTable(Table):
 class SignalTable(Table):
     """A signal: what moves with time, what it moves, and what a controller knows of it.
 
-    Each value holds until the next one; the last one until the end of `period` or `once`. A signal
+    Each value holds until the next one; the last one until the end of `period` or `once`. A sample
+    has the value at its begin, from its first to its last second. A signal
     that `measures` a disturbance has none: its values are what the plant realises.
     """
 
@@ -639,6 +640,7 @@ class Scenario(Shown, Table):
         for change in plant.changes or ():
             if signal.plant in change.parameters:
                 raise ValueError(f"{where}: plant '{signal.plant}' is set by plant.changes too")
+        self._check_durations(signal, where)
         state = signal.bounded_state
         if state and state not in plant.states:
             raise ValueError(
@@ -649,6 +651,22 @@ class Scenario(Shown, Table):
             raise ValueError(
                 f"{where}: reference '{signal.reference}' is no state or action"
                 f"{instead(signal.reference, names)}"
+            )
+
+    def _check_durations(self, signal: SignalTable, where: str) -> None:
+        """Raise ValueError where a value is so short that a sample may pass it over."""
+        if signal.measures is not None:
+            return
+        durations = [signal.length / len(signal.values)]
+        if signal.times is not None:
+            durations = [end - begin for begin, end in pairwise((*signal.times, signal.length))]
+        shortest = min(durations)
+        # Times in a file are rounded.
+        if shortest < self.sampling_time * (1.0 - 1e-4):
+            raise ValueError(
+                f"{where}: a value lasts {shortest:g} s, less than the sampling time of "
+                f"{self.sampling_time:g} s, and samples would pass it over: give values that last "
+                "a sample at least, such as means"
             )
 
     def _check_moving_bounds(self) -> None:

@@ -56,6 +56,24 @@ def test_values_hold_until_the_next_one_and_come_again(h):
     assert np.array_equal(values, np.tile(expected, 10_000))
 
 
+@pytest.mark.parametrize(
+    ("period", "expected"),
+    [
+        # A period of 2.5 samples: the second value begins at 75 s, the period anew at 150 s.
+        (150.0, [1.0, 1.0, 2.0, 1.0, 2.0]),
+        # And of 7/3 samples, 140 s: 0, 60, 120, 40, 100, 20, 80 s in it, the second from 70 s on.
+        (140.0, [1.0, 1.0, 2.0, 1.0, 2.0, 1.0, 2.0]),
+    ],
+)
+def test_a_sample_has_the_value_at_its_begin_where_the_period_is_no_number_of_samples(
+    period, expected
+):
+    table = PRICE | {"values": [1.0, 2.0], "period": period}
+    signals = Signals(with_signals(table))
+    values = signals.along(np.arange(100 * len(expected)))[:, 0]
+    assert np.array_equal(values, np.tile(expected, 100))
+
+
 def test_a_later_time_gives_later_values():
     table = PRICE | {"values": [1.0, 2.0, 5.0], "times": [0.0, 120.0, 180.0], "period": 600.0}
     model = {"controller": {"model": "controllers.evaporator:priced_model"}}
@@ -221,7 +239,7 @@ BAD = [
     (BOUND | {"values": [25.0]}, "give period"),
     (BOUND | {"values": [25.0], "period": 60.0, "once": 60.0}, "give period"),
     (BOUND | {"values": [math.nan], "period": 60.0}, "values"),
-    (BOUND | {"values": [25.0, 81.0, 101.0], "period": 60.0}, "comes up to 101"),
+    (BOUND | {"values": [25.0, 81.0, 101.0], "period": 180.0}, "comes up to 101"),
     (BOUND | {"values": [25.0], "period": 60.0, "bound": "x_l[X3]"}, "x_l\\[X3\\]' is of no state"),
     (BOUND | {"values": [25.0], "period": 60.0, "bound": "X2"}, "bound"),
     (BOUND | {"values": [25.0], "period": 60.0, "model": "T200"}, "one of model, bound"),
@@ -230,6 +248,12 @@ BAD = [
     (BOUND | {"values": [25.0], "period": 60.0, "ahead": 2}, "needs known = 'preview'"),
     ({"name": "a", "values": [1.0], "period": 60.0}, "it moves nothing"),
     ({"name": "a", "values": [1.0], "period": 60.0, "plant": "P100"}, "is an action"),
+    (BOUND | {"values": [25.0], "period": 45.0}, "a value lasts 45 s, less than the sampling time"),
+    (BOUND | {"values": [25.0, 26.0], "period": 90.0}, "a value lasts 45 s"),
+    (
+        BOUND | {"values": [25.0, 26.0, 27.0], "times": [0.0, 120.0, 150.0], "once": 600.0},
+        "a value lasts 30 s",
+    ),
     ({"name": "a", "values": [1.0], "period": 60.0, "plant": "UA2", "known": "now"}, "needs model"),
     ({"name": "a", "values": [1.0], "period": 60.0, "reference": "X9"}, "no state or action"),
     ({"name": "a", "file": "/nowhere.csv", "period": 60.0, "plant": "UA2"}, "cannot be read"),

@@ -29,16 +29,21 @@ def read_signal_file(path: str, name: str) -> dict[str, list[float]]:
     try:
         # Excel puts a byte order mark before a CSV file in UTF-8.
         with Path(path).open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if row]
+            reader = csv.reader(stream)
+            # Each with the number of its line, for messages.
+            rows = [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError, ValueError, csv.Error) as cause:
         raise ValueError(f"signal '{name}': file '{path}' cannot be read: {cause}") from None
     titles = []
-    for cell in rows[0] if rows else ():
+    for cell in rows[0][1] if rows else ():
         title, _, _ = cell.partition("[")
         titles.append(title.strip())
     if name not in titles:
         known = ", ".join(titles) or "nothing"
         raise ValueError(f"signal '{name}': file '{path}' has no column '{name}'; it has {known}")
+    for title in (name, TIME_COLUMN):
+        if titles.count(title) > 1:
+            raise ValueError(f"signal '{name}': file '{path}' has several columns '{title}'")
     content = {"values": _column_of(rows, titles, name, path)}
     if TIME_COLUMN in titles and name != TIME_COLUMN:
         content["times"] = _column_of(rows, titles, TIME_COLUMN, path)
@@ -46,7 +51,7 @@ def read_signal_file(path: str, name: str) -> dict[str, list[float]]:
 
 
 def _column_of(
-    rows: list[list[str]],
+    rows: list[tuple[int, list[str]]],
     titles: list[str],
     title: str,
     path: str,
@@ -54,8 +59,7 @@ def _column_of(
     """Numbers of a column; raises ValueError where a cell is none, with its line."""
     place = titles.index(title)
     numbers = []
-    # The titles are line 1.
-    for line, row in enumerate(rows[1:], start=2):
+    for line, row in rows[1:]:
         # A row may be shorter than the titles.
         cell = row[place].strip() if place < len(row) else ""
         # Infinity and NaN are numbers to Python, but no values of a signal.

@@ -75,6 +75,9 @@ def validated(
         return model.model_validate(document)
     except ValidationError as cause:
         first, *others = cause.errors(include_url=False)
+        # Of a list whose only entry is wrong pydantic says, too, that it has too few.
+        place = first["loc"]
+        others = [other for other in others if other["loc"] != place[: len(other["loc"])]]
         complaint = _complaint(dict(first), model)
         # One line: who has mended the first sees the next.
         if others:

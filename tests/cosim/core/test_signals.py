@@ -271,7 +271,10 @@ def test_a_signal_that_does_not_fit_is_one_line(table, message):
     ("cells", "message"),
     [
         ("a\n1\nnan\n", "line 3: a is no finite number but 'nan'"),
+        ("a\n1\n\nnan\n", "line 4: a is no finite number"),
         ("a\n1\n\n", None),
+        ("a,a\n1,2\n", "has several columns 'a'"),
+        ("a,time,time [s]\n1,0,0\n", "has several columns 'time'"),
         ("a,time\n1,0\n2,\n", "line 3: time is no finite number"),
         ("b\n1\n", "no column 'a'; it has b"),
         ("", "no column 'a'; it has nothing"),

@@ -5,9 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from tests.helpers.code_blocks import ROOT
+from tests.helpers.compiler import needs_compiler
 
 PAGES = {
     "rule": ("capped_td", "algorithm.md"),
@@ -49,3 +51,33 @@ def test_a_skeleton_runs_by_the_commands_that_are_printed(kind, cosim, tmp_path)
     env = os.environ | {"PATH": path}
     subprocess.run(script, shell=True, cwd=tmp_path, env=env, check=True)
     assert (tmp_path / "a folder" / "my_own-run" / "summary.json").is_file()
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_new_plant_runs_behind_the_sensors_that_are_proposed_and_with_a_signal(cosim, tmp_path):
+    """The drafted sensors without their #, an analyser among them, and a bound that moves."""
+    cosim("new", "plant", "mine", "--out", str(tmp_path))
+    subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, check=True)
+    scenario = tmp_path / "mine.toml"
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "cosim"]
+    init = ["scenario", "init", "mine.fmu", "--model", "mine:model", "--out", str(scenario)]
+    subprocess.run([*command, *init], cwd=tmp_path, env=env, check=True)
+    text, mark, proposed = scenario.read_text("utf-8").partition("# [[sensor]]")
+    assert mark
+    tables = (mark + proposed).replace("# ", "", 1).replace("\n# ", "\n")
+    slow = tables.replace('variable = "m"\n', 'variable = "m"\nevery = 15\n')
+    signal = (
+        '\n[[signal]]\nname = "least"\nvalues = [60.0, 65.0]\nperiod = 1200.0\n'
+        'bound = "x_l[T]"\nknown = "preview"\n'
+    )
+    scenario.write_text(text + slow + signal, "utf-8")
+    run = ["simulate", "-s", str(scenario), "-c", "tuned", "--steps", "60", "--out", "run"]
+    subprocess.run([*command, *run], cwd=tmp_path, env=env, check=True)
+    table = pd.read_csv(tmp_path / "run" / "trajectory.csv", comment="#")
+    column = {name.partition(" ")[0]: name for name in table.columns}
+    readings = table[column["measured[m]"]]
+    assert list(readings.index[readings.notna()]) == [0, 15, 30, 45]
+    assert table[column["estimated[m]"]].notna().all()
+    assert sorted(table[column["signal[least]"]].unique()) == [60.0, 65.0]

@@ -9,8 +9,8 @@ import rerun as rr
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
-from controllers.factories import naive
-from cosim import FmuPlant, simulate, train
+from controllers.factories import build_controller, naive
+from cosim import FmuPlant, Scenario, simulate, train
 from cosim.core.errors import RecordingError
 from cosim.core.trajectory import RunSignals, Signal, read_csv
 from cosim.recording import (
@@ -50,6 +50,23 @@ def test_signals_equal_the_csv_bit_for_bit(tmp_path, paper):
     assert recording.status == csv.status
     assert recording.samples.tolist() == list(range(1200))
     assert np.array_equal(recording.time, csv.time)
+
+
+@pytest.mark.parametrize("name", ["assay", "late", "set-point", "prices", "forecast"])
+def test_readings_estimates_and_signals_are_recorded_as_in_the_csv(name, tmp_path):
+    """The truth, what is measured with its gaps, what is estimated, and what moves."""
+    scenario = Scenario.load(name)
+    with FmuPlant(scenario) as plant:
+        recorder = RerunRecorder(tmp_path / "run.rrd")
+        controller = build_controller("naive", scenario)
+        run = simulate(plant, controller, 60, 3, recorder=recorder)
+    recording = read_recording(tmp_path / "run.rrd")
+    expected = ["X2", *scenario.measurement_names, *scenario.estimate_names, *scenario.signal_names]
+    for signal in expected:
+        assert np.array_equal(recording.signals[signal], run[signal], equal_nan=True), signal
+        assert recording.units[signal] == run.signals[signal].unit
+    if scenario.sensors:
+        assert np.isnan(recording.signals["measured[X2]"]).any()
 
 
 def test_a_block_that_the_loop_overwrites_is_recorded_as_it_was(tmp_path, paper, rng):

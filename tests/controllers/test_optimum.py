@@ -9,6 +9,7 @@ from controllers import OptimalPolicy, Quantity, evaporator, factories
 from controllers.dynamic_programming import BellmanOperator, Settings, objection
 from controllers.errors import OptimumError
 from controllers.optimum import SHIPPED_OPTIMA, optimum_key, read_optimum
+from controllers.periodic_optimum import periodic_key, periodic_plant, read_periodic
 from controllers.problem import PlantProblem, Problem
 from cosim import FmuPlant, Scenario, simulate
 
@@ -44,6 +45,17 @@ def test_presets_policies_are_shipped(name):
     certificate = read_optimum(path, key).certificate
     assert certificate
     assert objection(certificate) is None
+
+
+def test_the_optimum_of_the_prices_is_shipped():
+    """A policy for each of 1440 phases, with the certificate that `--refine` has made."""
+    key = periodic_key(periodic_plant(Scenario.load("prices")), Settings())
+    path = SHIPPED_OPTIMA / f"{key}.npz"
+    assert path.is_file(), "solve anew with `cosim optimum -s prices --refine`"
+    assert path.stat().st_size < 1_000_000
+    solution = read_periodic(path, key)
+    assert objection(solution.certificate) is None
+    assert solution.gain == pytest.approx(6336.05, abs=0.01)
 
 
 @pytest.mark.parametrize("name", GAINS)

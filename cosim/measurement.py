@@ -131,7 +131,10 @@ class MeasureItem(Item[Measured]):
         """
         length = self.noise.length
         seed = self.noise.seeds[0]
-        steps = min(PROBE_STEPS, length)
+        scenario = self.plant or self.conditions.scenario
+        # A run in which a late sensor is never read is refused.
+        arrivals = [sensor.delay + 1 for sensor in scenario.sensors or ()]
+        steps = min(max([PROBE_STEPS, *arrivals]), length)
         while True:
             noise = Noise((seed,), steps)
             probe = replace(self, noise=noise)

@@ -7,7 +7,7 @@ import pytest
 
 from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
-from cosim.core.errors import CosimWarning, EvaluationError
+from cosim.core.errors import CosimWarning, EvaluationError, ScenarioError
 from cosim.evaluation import named_controllers
 from cosim.workers import done
 from tests.helpers.loop import Proportional, hold, proportional
@@ -36,6 +36,14 @@ def test_rows_are_what_single_runs_give(paper):
     assert len(rows) == 6
     for name in ("economic_cost", "mean_violation", "violating_share", "J", "failures"):
         assert row[name] == alone[name]
+
+
+def test_a_sensor_that_is_late_is_evaluated_by_name():
+    """The run that shows how long one takes is long enough for the first reading."""
+    evaluation = evaluate("late", {"mine": "naive"}, 2, 40)
+    assert len(evaluation.to_pandas()) == 2
+    with pytest.raises(ScenarioError, match="never read"):
+        evaluate("late", {"mine": "naive"}, 2, 15)
 
 
 def test_gain_and_gap_are_taken_against_naive_and_optimal(paper):

@@ -386,7 +386,8 @@ def decimals(value: float, digits: int) -> int:
         value: the number.
         digits: significant ones.
     """
-    if not isfinite(value) or value == 0:
+    # Nine decimals would show nothing of a smaller number, but for its zeros.
+    if not isfinite(value) or abs(value) < 0.5e-9:
         return 0
     # The power of ten of the first significant digit.
     first_digit = floor(log10(abs(value)))
@@ -540,9 +541,11 @@ def two_way(
     equal = np.full(n_seeds, 1 / n_seeds)
     counts = rng.multinomial(n_seeds, equal, size=draws)
     weights = counts.T / n_seeds
-    # An infinite cost stays one in every draw, where 0·∞ would be no number.
+    # An infinite cost stays one in every draw, where 0·∞ would be no number. Where the counterpart
+    # alone is infinite the difference is minus infinity; a cost that is no number is the worst.
     finite = np.isfinite(terms).all(axis=1)
-    values = np.full((n_runs, draws), np.inf)
+    infinite = np.nan_to_num(terms.sum(axis=1), nan=np.inf, posinf=np.inf, neginf=-np.inf)
+    values = np.repeat(infinite[:, None], draws, axis=1)
     above = terms[finite] @ weights
     values[finite] = above / (below @ weights)
     # In each draw of the noise, as many runs as there are, with replacement.

@@ -128,6 +128,19 @@ def test_the_interval_of_equal_runs_is_their_very_value():
         assert over_runs([np.full(4, value)]).interval == (value, value)
 
 
+def test_rounding_about_zero_is_shown_as_zero():
+    assert shown(3e-17, (0.0, 5e-17), scale=100.0, digits=3) == "0 [0, 0]"
+
+
+def test_a_diverged_counterpart_is_the_worst_one_not_the_case():
+    cost = np.full((7, 4), 9.0)
+    other = np.full((7, 4), 10.0)
+    other[-1] = np.inf
+    median, interval, _ = paired_difference(cost, other, np.full(4, 10.0))
+    assert median == pytest.approx(-0.1)
+    assert interval[1] == pytest.approx(-0.1)
+
+
 def test_a_diverged_run_is_the_worst_and_spoils_no_interval():
     cost = 100.0 + np.arange(1.0, 8.0)[:, None] + np.zeros((7, 4))
     cost[-1] = np.nan

@@ -169,7 +169,15 @@ for panel, group, name, *examples in (
         "plan mine.toml",
         "report study",
     ),
-    (CHECK, study.results_app, "results", "check quick", "update quick", "draw quick"),
+    (
+        CHECK,
+        study.results_app,
+        "results",
+        "check quick",
+        "update quick",
+        "report quick",
+        "draw quick",
+    ),
     (PLANT, fmu.fmu_app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
 ):
     texts = [f"Example: cosim {name} {example}" for example in examples]

@@ -297,6 +297,33 @@ def update_results(
         out_.json({"updated": list(names or studies)})
 
 
+@results_app.command("report")
+def report_results(
+    names: NamesArgument = None,
+    folder: Annotated[Path, typer.Option("--results")] = Path("results"),
+    json: cli.JsonOption = False,
+) -> None:
+    """Make the statistics and reports of stored studies anew, and the folder's README.
+
+    They come from the stored measurements; no study is run. Times of the processor are not stored,
+    so a report that is made anew has none.
+
+    Args:
+        folder: Folder with the studies and tolerances.toml.
+    """
+    with cli.output(json) as out_:
+        from cosim.studies import stored
+
+        studies = stored.stored_studies(folder)
+        kept = [name for name in studies if (folder / name).is_dir()]
+        chosen = stored.chosen(studies, names or kept)
+        for name in chosen:
+            stored.report_stored(folder, name)
+            out_.note(f"{name}: {folder / name / 'report.md'}")
+        stored.write_readme(folder, studies)
+        out_.json({"reported": chosen})
+
+
 @results_app.command("draw")
 def draw_results(
     names: NamesArgument = None,

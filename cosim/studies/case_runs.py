@@ -162,13 +162,17 @@ class CaseRuns:
     # Against another case
 
     def difference_from(self, other: CaseRuns) -> dict[str, float]:
-        """Columns of the paired difference from another case on the scenario; NaN if unknown."""
+        """Columns of the paired difference from another case on the scenario; NaN if unknown.
+
+        The difference is relative to |J*|; where no J* is known, to the other case's |J|.
+        """
         difference = Estimate(np.nan)
         p = np.nan
         J, other_J = self._pairs_with(other)
-        # Without J*, or a training seed in common, nothing is known.
-        if self.optimum is not None and J.size:
-            median, interval, p = paired_difference(J, other_J, self.optimum)
+        unit = self._unit_against(other_J)
+        # Without a training seed in common, or with no unit, nothing is known.
+        if J.size and np.isfinite(unit).all():
+            median, interval, p = paired_difference(J, other_J, unit)
             difference = Estimate(median, interval)
         return {**columns_of("difference", difference), "difference_p": p}
 
@@ -178,9 +182,22 @@ class CaseRuns:
         # Without a training seed in common nothing is known.
         if not J.size:
             return False
-        # Without J* the other's cost is the unit of the difference, whose sign counts.
-        unit = other_J.mean(axis=0) if self.optimum is None else self.optimum
+        unit = self._unit_against(other_J)
+        # Half of the other's runs diverged: there is no unit.
+        if not np.isfinite(unit).all():
+            return False
         return costs_more(J, other_J, unit)
+
+    def _unit_against(self, other_J: Array) -> Array:
+        """J* (S,), or where none is known the median of the other case's runs, J' (R, S)."""
+        if self.optimum is not None:
+            return self.optimum
+        # Of no pair there is no median.
+        if not other_J.size:
+            return np.empty(0)
+        # Not the mean: one run that diverged would make the unit infinite.
+        median: Array = np.median(other_J, axis=0)
+        return median
 
     def _pairs_with(self, other: CaseRuns) -> tuple[Array, Array]:
         """J (R, S) of two cases over the training seeds that both have; a controller has any."""

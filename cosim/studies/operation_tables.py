@@ -85,7 +85,7 @@ def operation_tables(
     # The effort is that of whole runs.
     end = result.runs[result.runs.samples == marks[-1]]
     title = f"What {times[-1]} of operation took on `{scenario}`, medians"
-    header = (
+    effort_header = [
         "case",
         "runs",
         "first change, samples",
@@ -94,9 +94,11 @@ def operation_tables(
         "dearest 100 samples %",
         "updates",
         "model samples",
-        "processor s",
-    )
-    yield title, header, _effort_rows(end, seconds, WEEK / layout.sampling_time)
+    ]
+    # Stored studies have no times.
+    if seconds:
+        effort_header.append("processor s")
+    yield title, effort_header, _effort_rows(end, seconds, WEEK / layout.sampling_time)
 
     # Where θ never moves there is no shift to compare.
     rows = _shift_rows(end)
@@ -163,26 +165,26 @@ def _effort_rows(
 
     Args:
         end: rows of the runs at the last mark.
-        seconds: processor time of each case.
+        seconds: processor time of each case; empty where none is known.
         samples_per_week: of the plant.
     """
     rows = []
     for group, runs in end.groupby("case", sort=False):
         case = str(group)
         median = runs[EFFORT_COLUMNS].median()
-        rows.append(
-            [
-                case,
-                str(len(runs)),
-                _whole(median.first_change),
-                f"{100 * median.violating:.2f}",
-                _violations_cell(runs.violating, samples_per_week),
-                f"{100 * median.dearest:.1f}",
-                _whole(median.updates),
-                _whole(median.model_samples),
-                _whole(seconds.get(case, np.nan)),
-            ]
-        )
+        cells = [
+            case,
+            str(len(runs)),
+            _whole(median.first_change),
+            f"{100 * median.violating:.2f}",
+            _violations_cell(runs.violating, samples_per_week),
+            f"{100 * median.dearest:.1f}",
+            _whole(median.updates),
+            _whole(median.model_samples),
+        ]
+        if seconds:
+            cells.append(_whole(seconds.get(case, np.nan)))
+        rows.append(cells)
     return rows
 
 

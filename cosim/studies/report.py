@@ -31,6 +31,8 @@ PAGE = "report.html"
 MARKDOWN = "report.md"
 FOLDER = "figures"
 """Folder of the figures."""
+_OTHER_UNIT = "No J* is known: a difference is relative to |J'|, of the case under against."
+_BEST_CASE = "Regrets in operation are against the best case at the time."
 
 
 def write_report(study: StudyMeasurements, figures: Mapping[str, Sequence[str]]) -> Path:
@@ -43,10 +45,35 @@ def write_report(study: StudyMeasurements, figures: Mapping[str, Sequence[str]])
     Returns:
         The HTML page.
     """
+
+    def picture(name: str) -> dict[str, str] | None:
+        path = study.folder / FOLDER / f"{name}.svg"
+        # Those of a stored study's single runs are there once `cosim results draw` drew them.
+        return _image(path) if path.is_file() else None
+
+    page = rendered(PAGE, **_content(study, figures), picture=picture)
+    write_atomically(study.folder / PAGE, page)
+    write_markdown(study, figures)
+    return study.folder / PAGE
+
+
+def write_markdown(study: StudyMeasurements, figures: Mapping[str, Sequence[str]]) -> None:
+    """Write report.md of a study into its folder.
+
+    Args:
+        study: the measurements.
+        figures: names of each scenario's figures, which the page links.
+    """
+    page = rendered(MARKDOWN, **_content(study, figures))
+    write_atomically(study.folder / MARKDOWN, page)
+
+
+def _content(study: StudyMeasurements, figures: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """What the templates of both pages fill in."""
     n_runs = len(study.state)
     # A study that was given as a mapping has no file; the command names one of its name.
     file = study.about.get("file") or f"{study.name}.toml"
-    content = {
+    return {
         "title": study.about["title"] or study.name,
         "description": study.about["description"],
         "runs": n_runs,
@@ -57,17 +84,6 @@ def write_report(study: StudyMeasurements, figures: Mapping[str, Sequence[str]])
         "made": _made_with(study.about["made_with"]),
         "date": _date(study.folder / TIMING),
     }
-
-    def picture(name: str) -> dict[str, str] | None:
-        path = study.folder / FOLDER / f"{name}.svg"
-        # Those of a stored study's single runs are there once `cosim results draw` drew them.
-        return _image(path) if path.is_file() else None
-
-    # The templates have the names of the pages.
-    for name in (MARKDOWN, PAGE):
-        page = rendered(name, **content, picture=picture)
-        write_atomically(study.folder / name, page)
-    return study.folder / PAGE
 
 
 def rendered(template: str, **context: Any) -> str:
@@ -141,6 +157,10 @@ def _noise_note(study: StudyMeasurements, scenario: str) -> str:
         return "No run is finished."
     n_seeds = rows.seed.nunique()
     note = f"Table and regret: {n_seeds} noise seeds × {rows.steps.iloc[0]} samples."
+    if study.reference("optimum", scenario) is None:
+        note += f" {_OTHER_UNIT}"
+        if scenario in study.scenarios_in_operation:
+            note += f" {_BEST_CASE}"
     if scenario not in study.about["curves"]:
         return note
     curve_seeds, curve_steps = study.about["curves"][scenario]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from cosim.core.errors import ResultsError
-from cosim.core.files import read_toml, write_atomically
+from cosim.core.files import read_toml, temporary_folder, write_atomically
 from cosim.core.protocols import Array
 from cosim.core.scenario import Table
 from cosim.core.validation import instead, validated
@@ -25,7 +25,7 @@ from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
 from cosim.studies.kept import draw_kept
 from cosim.studies.plan import LOGS, THETA, TRAJECTORIES, plan
-from cosim.studies.report import FOLDER, rendered
+from cosim.studies.report import FOLDER, rendered, write_markdown
 from cosim.studies.results import StudyResults
 from cosim.studies.run import GREEDY, RUNS_FOLDER, frame_csv
 from cosim.studies.tables import (
@@ -42,6 +42,11 @@ from cosim.studies.tables import (
 TOLERANCES = "tolerances.toml"
 DIGITS = 8
 """Significant digits of stored numbers."""
+SAME_NUMBER = 2e-7
+"""Difference of a statistic of measurements and of the same ones, rounded to `DIGITS`.
+
+It is relative, and absolute too: a regret is a small difference of two rounded costs.
+"""
 WORK = ".work"
 """Folder within the folder, of the runs of studies."""
 WORD_COLUMNS = ("status", "against", "hash")
@@ -178,6 +183,57 @@ def draw_stored(folder: Path, name: str) -> list[str]:
         study = Study.load(folder / f"{name}.toml")
         names += draw_kept(plan(study), stored, ("svg",))
     return names
+
+
+def report_stored(folder: Path, name: str) -> None:
+    """Make the statistics and report.md of a stored study anew from its measurements.
+
+    Nothing is run. Times of the processor are not stored, so the report has none.
+
+    Args:
+        folder: of the stored studies.
+        name: of the study.
+
+    Raises:
+        StudyError: if the study is not stored or its tables are damaged.
+    """
+    stored = folder / name
+    study = StudyResults.load(stored)
+    statistics = {SUMMARY: study.summary}
+    if len(study.aggregate):
+        statistics[AGGREGATE] = study.aggregate
+    with temporary_folder("cosim-report-") as work:
+        for table_name, table in statistics.items():
+            fresh = work / table_name
+            fresh.write_text(frame_csv(table), "utf-8")
+            # In the digits of what is stored.
+            rounded = _texts(fresh).map(_rounded_cell)
+            kept = _with_stored_digits(rounded, _texts(stored / table_name))
+            write_atomically(stored / table_name, frame_csv(kept))
+        # Which figures there are; they are drawn on demand, and not stored.
+        figures = study.draw(work / FOLDER, ("svg",))
+    write_markdown(study, figures)
+
+
+def _with_stored_digits(now: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
+    """A table's texts, with the stored ones where both are the same number to `SAME_NUMBER`.
+
+    Stored measurements are rounded: that moves the last digit of a statistic made of them.
+
+    Args:
+        now: the table as it is made now.
+        before: the stored one.
+    """
+    keys = [name for name in WHERE if name in now.columns]
+    same_rows = list(now.columns) == list(before.columns) and now[keys].equals(before[keys])
+    # Where rows moved there is no cell to compare.
+    if not same_rows:
+        return now
+    numbers_now = now.apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
+    numbers_before = before.apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
+    # A word is no number, and comes from the new table.
+    is_same = np.isclose(numbers_now, numbers_before, rtol=SAME_NUMBER, atol=SAME_NUMBER)
+    return now.mask(is_same, before)
 
 
 def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:

@@ -57,6 +57,16 @@ def test_the_page_holds_every_row_figure_and_definition(results, page):
     assert "2 other seeds × 20 samples" in page
 
 
+def test_without_an_optimum_the_text_above_a_table_names_the_unit_of_differences(
+    results, page, tmp_path
+):
+    note = "No J* is known: a difference is relative to |J'|"
+    unknown = replace(results, folder=tmp_path, about={**results.about, "optimum": {}})
+    unknown.report()
+    assert note in (tmp_path / "report.md").read_text("utf-8")
+    assert note not in (results.folder / "report.md").read_text("utf-8")
+
+
 @pytest.mark.slow
 def test_a_study_of_baselines_alone_draws_no_course_of_learning(tmp_path):
     baseline = {"name": "grow", "algorithm": GROW, "samples": 200, "group": "baselines"}

@@ -4,6 +4,7 @@ import re
 import shutil
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
@@ -124,6 +125,23 @@ def test_a_stored_study_s_figures_are_drawn_from_its_tables(mini, tmp_path):
     assert {"figures/overlay-paper-loop.svg", "figures/regret-paper.svg"} <= set(linked)
     drawn = [path.relative_to(folder / "mini").as_posix() for path in folder.rglob("*.svg")]
     assert sorted(drawn) == sorted(linked)
+
+
+def test_reports_are_made_anew_from_the_stored_measurements_alone(mini, tmp_path):
+    folder = tmp_path / "results"
+    shutil.copytree(mini, folder, ignore=shutil.ignore_patterns(".work"))
+    made = ("mini/summary.csv", "mini/report.md", "README.md")
+    summary = pd.read_csv(folder / "mini" / "summary.csv", dtype=str)
+    summary["J_median"] = "1.0"
+    summary.to_csv(folder / "mini" / "summary.csv", index=False)
+    for name in made[1:]:
+        (folder / name).write_text("stale")
+    before = {path for path in folder.rglob("*") if path.is_file()}
+    result = run("report", "mini", "--results", folder)
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    for name in made:
+        assert (folder / name).read_text("utf-8") == (mini / name).read_text("utf-8"), name
+    assert {path for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_a_report_of_a_stored_study_without_its_figures_says_so(mini, tmp_path):

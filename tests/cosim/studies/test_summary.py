@@ -246,6 +246,26 @@ def test_a_difference_has_the_sign_of_the_case_that_costs_more():
     assert row_of(table, "cheap")["difference"] == pytest.approx(-0.2)
 
 
+def test_without_an_optimum_a_difference_is_relative_to_the_counterpart():
+    costs = {"dear": [[13.0, 13.0], [14.0, 14.0]], "cheap": [[10.0, 10.0], [10.0, 10.0]]}
+    study = results(costs, against={"dear": "cheap", "cheap": "dear"})
+    study.about["optimum"].clear()
+    table = study.summary
+    assert row_of(table, "dear")["difference"] == pytest.approx(0.35)
+    assert row_of(table, "dear")["difference_p"] == pytest.approx(0.5)
+    assert row_of(table, "cheap")["difference"] == pytest.approx(-3.5 / 13.5)
+
+
+def test_without_an_optimum_one_diverged_counterpart_leaves_the_difference_known():
+    costs = {"a": [[9.0, 9.0]] * 3, "b": [[10.0, 10.0], [10.0, 10.0], [np.inf, np.inf]]}
+    study = results(costs, against={"a": "b"})
+    study.about["optimum"].clear()
+    row = row_of(study.summary, "a")
+    assert row["difference"] == pytest.approx(-0.1)
+    assert row["difference_low"] == -np.inf
+    assert row["difference_high"] == pytest.approx(-0.1)
+
+
 def test_cases_without_a_training_seed_in_common_have_no_difference():
     costs = {"a": [[12.0, 12.0], [13.0, 13.0]], "b": [[11.0, 11.0], [11.5, 11.5]]}
     study = results(costs, against={"a": "b"})

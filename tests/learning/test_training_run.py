@@ -6,11 +6,13 @@ import pytest
 import fmus
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.core.training_options import TrainingOptions
+from cosim.plant import FmuPlant
 from learning import QLearning
+from learning.algorithm import load_algorithm
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.exploration import Strategy
-from learning.training_run import make_run, starting_parameters
+from learning.training_run import begin_training, make_run, starting_parameters
 
 
 def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(problem):
@@ -102,3 +104,25 @@ def test_checkpoints_are_close_where_a_step_may_take_long(scenario):
     fast = make_run("q-learning", scenario, 20_000)
     assert (slow.log_every, slow.checkpoint_every, slow.evaluate_every) == (100, 100, 5000)
     assert (fast.log_every, fast.checkpoint_every, fast.evaluate_every) == (1000, 5000, 5000)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "retreats"),
+    [
+        ("q-learning", True),
+        ("batch-q-learning", True),
+        ("actor-critic", True),
+        ("model-based", True),
+        ("dyna", True),
+        ("offset-free", True),
+        ("identified", True),
+        # These try θ on the plant, and end at the one that cost least.
+        ("backoff", False),
+        ("policy-search", False),
+    ],
+)
+def test_each_rule_in_operation_retreats_unless_it_tries_theta(scenario, algorithm, retreats):
+    run = make_run(algorithm, scenario, 400)
+    with FmuPlant(scenario) as plant:
+        loop = begin_training(run, load_algorithm(algorithm), plant)
+        assert any(name.startswith("retreat") for name in loop.state_dict()) is retreats

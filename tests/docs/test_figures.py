@@ -158,3 +158,23 @@ def test_every_row_of_a_marked_table_is_stored(kind, study, head, line):
         middle, worst = re.fullmatch(r"([-\d.]+)(?: \(([-\d.]+)\))?", cell).groups()
         assert middle in written(median(values)), (column, cell, median(values))
         assert worst is None or worst in written(max(values)), (column, cell, max(values))
+
+
+DIFFERENCES = re.compile(r"<!-- difference of (\S+) -->\n((?:\|.*\n)+)")
+
+
+def test_the_differences_of_the_results_page_are_stored():
+    page = (ROOT / "docs" / "results.md").read_text()
+    compared = 0
+    for study, table in DIFFERENCES.findall(page):
+        stored = {(row["scenario"], row["case"]): row for row in rows(study, "summary")}
+        header, _, *lines = (re.split(r" *\| *", line)[1:-1] for line in table.splitlines())
+        for case, *cells in lines:
+            for scenario, cell in zip(header[1:], cells, strict=True):
+                row = stored[scenario.strip("`"), case.strip("`")]
+                names = ("difference", "difference_low", "difference_high")
+                value, low, high = (100 * float(row[name]) for name in names)
+                assert row["against"] == "fixed"
+                assert cell == f"{value:.3f} [{low:.3f}, {high:.3f}]", (scenario, case)
+                compared += 1
+    assert compared == 12

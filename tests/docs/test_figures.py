@@ -2,6 +2,7 @@
 
 import csv
 import re
+import tomllib
 from collections import defaultdict
 from functools import cache
 from statistics import fmean, median
@@ -178,3 +179,20 @@ def test_the_differences_of_the_results_page_are_stored():
                 assert cell == f"{value:.3f} [{low:.3f}, {high:.3f}]", (scenario, case)
                 compared += 1
     assert compared == 12
+
+
+def test_the_results_page_names_each_study_that_has_less_noise_than_its_file_says():
+    page = (ROOT / "docs" / "results.md").read_text()
+    _, _, rest = page.partition("Stored with one to six seeds, fewer than their files say now: ")
+    named = set(re.findall(r"`(operation-[\w-]+)`", rest.partition(". ")[0]))
+    found = set()
+    for file in (ROOT / "results").glob("operation-*.toml"):
+        if not (file.with_suffix("") / "greedy.csv").is_file():
+            continue
+        wanted = tomllib.loads(file.read_text())["evaluation"]["seeds"]
+        if any(
+            len({row["seed"] for row in rows(file.stem, table)}) < wanted
+            for table in ("evaluation", "greedy")
+        ):
+            found.add(file.stem)
+    assert named == found

@@ -2,13 +2,15 @@
 
 A log is a week of one plant under one regime. A rule learns from it alone; then the plant itself
 says what θ costs, on noise that no log met. Each log is a row of FOLDER/logs.csv, appended once it
-is judged: the command goes on where it was ended. FOLDER/table.md sums the rows up.
+is judged, seed by seed over all plants: the command goes on where it was ended, and its first rows
+are a fair sample. FOLDER/table.md sums the rows up.
 
 The regimes are `pi`, `lqr`, `cautious`, and `steps`: `cautious` with an operator's steps on top.
 """
 
 import argparse
 import csv
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import product
@@ -71,6 +73,8 @@ COLUMNS = (
     "J",
     "J_optimal",
 )
+JUDGES = {}
+"""The plants of this process, by name."""
 
 
 class OperatorSteps:
@@ -194,28 +198,43 @@ class Judge:
         return [*row, self.start_costs.mean(), self.optimal]
 
 
-def calibrate(algorithm, plants, regimes, seeds, path):
-    """Append the rows that a file of logs lacks, seed by seed."""
+def row_of(algorithm, name, regime, seed):
+    """A log's row, by a plant that this process keeps for the rows to come."""
+    if name not in JUDGES:
+        scenario = Scenario.load(name)
+        JUDGES[name] = Judge(scenario, FmuPlant(scenario), algorithm)
+    with temporary_folder("cosim-logs-") as folder:
+        return JUDGES[name].row(regime, seed, Path(folder))
+
+
+def calibrate(algorithm, plants, regimes, seeds, path, jobs):
+    """Append the rows that a file of logs lacks, seed by seed, by so many processes."""
     done = set()
     if path.exists():
         for row in rows_of(path):
             done.add((row["plant"], row["regime"], int(row["seed"])))
     else:
         write_atomically(path, ",".join(COLUMNS) + "\n")
-    judges = {}
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(temporary_folder("cosim-logs-")))
+        # All rows of a plant are of one process, which sets it up once.
+        processes = []
+        for _ in range(jobs):
+            processes.append(stack.enter_context(ProcessPoolExecutor(1)))
+        pending = []
         for seed, name, regime in product(seeds, plants, regimes):
             if (name, regime, seed) in done:
                 continue
-            if name not in judges:
-                scenario = Scenario.load(name)
-                plant = stack.enter_context(FmuPlant(scenario))
-                judges[name] = Judge(scenario, plant, algorithm)
-            row = judges[name].row(regime, seed, folder)
-            cells = [f"{x:.8g}" if isinstance(x, float) else str(x) for x in row]
-            with path.open("a", encoding="utf-8") as file:
-                file.write(",".join(cells) + "\n")
+            process = processes[plants.index(name) % jobs]
+            pending.append(process.submit(row_of, algorithm, name, regime, seed))
+        for row in pending:
+            append_row(path, row.result())
+
+
+def append_row(path, row):
+    """Append a row of `COLUMNS` to a file."""
+    cells = [f"{x:.8g}" if isinstance(x, float) else str(x) for x in row]
+    with path.open("a", encoding="utf-8") as file:
+        file.write(",".join(cells) + "\n")
 
 
 def rows_of(path):
@@ -242,20 +261,34 @@ def nearly_holds(row, name):
     return reaches_low and reaches_high
 
 
+def gives_interval(row, name):
+    """Whether the row predicts an interval: a refused log gives none, nor does a lost rollout."""
+    return bool(np.isfinite(row[f"{name}_low"]) and np.isfinite(row[f"{name}_high"]))
+
+
+def percentage(flags):
+    """The share of flags that are true, in words; empty of none."""
+    return f"{100 * np.mean(flags):.1f} %" if flags else ""
+
+
 def table(rows):
     """Markdown: a line for each regime, and one for all."""
     lines = [
-        "| logged by | logs | intervals that hold | within the truth's error | `better` | "
-        "costs more than what was logged | regret %, median | largest |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|",
+        "| logged by | logs | refused | intervals | of which hold | within the truth's error | "
+        "`better` | costs more than what was logged | regret %, median | largest |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for regime in (*REGIMES, "all"):
         chosen = [row for row in rows if regime in (row["regime"], "all")]
         if not chosen:
             continue
-        both = [(row, name) for row in chosen for name in ("less_start", "less_log")]
-        share = 100 * np.mean([holds(*pair) for pair in both])
-        near = 100 * np.mean([nearly_holds(*pair) for pair in both])
+        refused = sum(row["verdict"] == "refused" for row in chosen)
+        both = []
+        for row, name in product(chosen, ("less_start", "less_log")):
+            if gives_interval(row, name):
+                both.append((row, name))
+        share = percentage([holds(*pair) for pair in both])
+        near = percentage([nearly_holds(*pair) for pair in both])
         better = sum(row["verdict"] == "better" for row in chosen)
         # The same noise judges both: the start costs what the learned θ does, less its difference.
         worse = 0
@@ -270,8 +303,8 @@ def table(rows):
                 regrets.append(100 * (row["J"] / row["J_optimal"] - 1))
         regret = f"{np.median(regrets):.2f} | {max(regrets):.2f}" if regrets else " | "
         lines.append(
-            f"| `{regime}` | {len(chosen)} | {share:.1f} % | {near:.1f} % | {better} | "
-            f"{100 * worse / len(chosen):.1f} % | {regret} |"
+            f"| `{regime}` | {len(chosen)} | {refused} | {len(both)} | {share} | {near} | "
+            f"{better} | {100 * worse / len(chosen):.1f} % | {regret} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -284,13 +317,14 @@ def main():
     parser.add_argument("--regimes", default=",".join(REGIMES))
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--logs", type=int, default=LOGS, help="of each plant and regime")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share the plants")
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
     path = chosen.out / "logs.csv"
     seeds = range(chosen.first_seed, chosen.first_seed + chosen.logs)
     plants = chosen.plants.split(",")
     regimes = chosen.regimes.split(",")
-    calibrate(chosen.algorithm, plants, regimes, seeds, path)
+    calibrate(chosen.algorithm, plants, regimes, seeds, path, chosen.jobs)
     text = table(rows_of(path))
     write_atomically(chosen.out / "table.md", text)
     print(text, end="")

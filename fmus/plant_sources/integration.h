@@ -48,8 +48,8 @@ static double runge_kutta(double v[N_VARIABLES], double h) {
         const double error = h / 6.0 * fabs(v[DERIVATIVE_REFERENCES[i]] - slope[i]);
         const double reached = fmax(fabs(x[i]), fabs(v[state]));
         const double size = fmax(reached, SMALLEST_SIZE * VARIABLES[state].nominal);
-        /* What is no number counts as too large. */
-        if (!(error / size <= largest)) largest = error / size;
+        if (!isfinite(error)) return INFINITY;
+        largest = fmax(largest, error / size);
     }
     return largest;
 }

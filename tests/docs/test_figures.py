@@ -196,3 +196,24 @@ def test_the_results_page_names_each_study_that_has_less_noise_than_its_file_say
         ):
             found.add(file.stem)
     assert named == found
+
+
+def test_the_counts_of_random_plants_are_stored():
+    page = (ROOT / "docs" / "results.md").read_text()
+    ((study, table),) = re.findall(r"<!-- counts of (\S+) -->\n((?:\|.*\n)+)", page)
+    stored = rows(study, "summary")
+    start = {row["scenario"]: float(row["J_median"]) for row in stored if row["case"] == "fixed"}
+    _, _, *lines = (re.split(r" *\| *", line)[1:-1] for line in table.splitlines())
+    for case, *cells in lines:
+        of_case = [row for row in stored if row["case"] == case.strip("`")]
+        assert len(of_case) == len(start) == 16
+        differences = [100 * float(row["difference"]) for row in of_case]
+        worst = [100 * (float(row["J_worst"]) / start[row["scenario"]] - 1) for row in of_case]
+        expected = [
+            sum(float(row["difference_high"]) < 0 for row in of_case),
+            sum(float(row["difference_low"]) > 0 for row in of_case),
+            f"{median(differences):.2f}",
+            f"{max(differences):.2f}",
+            f"{max(worst):.2f}",
+        ]
+        assert cells == list(map(str, expected))

@@ -1149,12 +1149,20 @@ def _log(
         print(f"{name}: {text}", file=sys.stderr)
 
 
-# fmpy's proxy, which formats the variadic message, knows one Python logger per process.
+_logger = fmi2.fmi2CallbackLoggerTYPE(_log)
 _callbacks = fmi2.fmi2CallbackFunctions()
-_callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_log)
 _callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
 _callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
-addLoggerProxy(ctypes.byref(_callbacks))
+
+
+def _claim_logger() -> None:
+    """Have the FMUs' messages come to us.
+
+    fmpy's proxy, which formats the variadic message, knows one Python logger per process. Whoever
+    simulates by fmpy beside us gives it another one, which is gone when that simulation ends.
+    """
+    _callbacks.logger = _logger
+    addLoggerProxy(ctypes.byref(_callbacks))
 
 
 def _optional(value: float | None, truth: Any) -> tuple[Any, Any]:
@@ -1200,6 +1208,7 @@ class Fmi2Instance(Instance):
         name = f"cosim-{next(_instance_numbers)}"
         _logs[name.encode()] = self.messages
         slave = FMU2ByPath(instanceName=name, **where)
+        _claim_logger()
         slave.instantiate(callbacks=_callbacks, loggingOn=True)
         return slave
 

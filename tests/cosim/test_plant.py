@@ -1,9 +1,12 @@
+import gc
 import mmap
 from pathlib import Path
 
+import fmpy
 import numpy as np
 import pytest
 
+import fmus
 from cosim import FmuPlant, Scenario
 from cosim.core.errors import PlantError
 
@@ -255,3 +258,14 @@ def test_an_fmu_without_a_switch_of_its_noise_is_undisturbed_by_ranges_of_zero(p
         plant.reset(5)
         step = plant.step(paper.reference_action)
     np.testing.assert_array_equal(step.disturbance, paper.disturbance.nominal)
+
+
+def test_who_simulates_by_fmpy_beside_us_does_not_take_our_messages(paper):
+    taken = []
+    fmpy.simulate_fmu(str(fmus.path()), stop_time=60.0, logger=lambda *words: taken.append(words))
+    gc.collect()
+    count = len(taken)
+    longest = paper.replace({"disturbance": {"time_constant": [1e9] * 4}})
+    with pytest.raises(PlantError, match="outside"), FmuPlant(longest) as plant:
+        plant.reset(0)
+    assert len(taken) == count

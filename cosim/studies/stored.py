@@ -64,7 +64,7 @@ KEY_COLUMNS = {
     THETA: ["schema"],
 }
 """Key columns of a study's tables, by their file or by the folder that they are in."""
-LARGEST = 4_000_000
+LARGEST = 5_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
 STORED_SUFFIXES = (".csv", ".toml", ".md")
 """Of the files that are stored: figures are drawn from them."""

@@ -210,11 +210,8 @@ def draft_scenario(
     if model is not None:
         document["controller"]["model"] = model
         # A controller's scaling wants both bounds of each state; others can do without.
-        limits = []
-        for name, value in zip(roles.states, x.tolist(), strict=True):
-            limits.append(limits_of(archive, name, value))
-        document["bounds"]["state_lower"] = [low for low, _ in limits]
-        document["bounds"]["state_upper"] = [high for _, high in limits]
+        state_lower, state_upper = _all_limits(archive, roles.states, x)
+        document["bounds"] |= {"state_lower": state_lower, "state_upper": state_upper}
     if str(fmu) not in SHIPPED_FMUS:
         # A file on another drive keeps its absolute path.
         with suppress(ValueError):
@@ -260,12 +257,7 @@ def first_document(
     mapping = _mapping(archive, roles.disturbances)
     n = len(roles.states)
     u = _start_vector(archive, roles.actions, action, "action")
-    action_lower = []
-    action_upper = []
-    for name, value in zip(roles.actions, u.tolist(), strict=True):
-        low, high = limits_of(archive, name, value)
-        action_lower.append(low)
-        action_upper.append(high)
+    action_lower, action_upper = _all_limits(archive, roles.actions, u)
     state_lower = []
     state_upper = []
     for name in roles.states:
@@ -506,6 +498,21 @@ def limits_of(
     reach = abs(centre) or 1.0
     lower = low if isfinite(low) else centre - reach
     upper = high if isfinite(high) else centre + reach
+    return lower, upper
+
+
+def _all_limits(
+    fmu: UnpackedFmu,
+    names: Sequence[str],
+    values: Array,
+) -> tuple[list[float], list[float]]:
+    """Lower and upper limits of variables (`limits_of`) about their values."""
+    lower = []
+    upper = []
+    for name, value in zip(names, values.tolist(), strict=True):
+        low, high = limits_of(fmu, name, value)
+        lower.append(low)
+        upper.append(high)
     return lower, upper
 
 
@@ -755,26 +762,22 @@ def _remarks_of_limits(document: dict[str, Any], fmu: UnpackedFmu) -> dict[str, 
     remarks = {}
     # Without a model a state may well have one bound alone, or none.
     has_model = "model" in document["controller"]
-    unbounded = []
-    half_bounded = []
-    for name in plant["states"]:
-        stated = [isfinite(limit) for limit in fmu.range(name)]
-        if not any(stated):
-            unbounded.append(name)
-        if not all(stated):
-            half_bounded.append(name)
+    half_bounded = _half_bounded(fmu, plant["states"])
+    unbounded = [name for name in half_bounded if not any(map(isfinite, fmu.range(name)))]
     if has_model and half_bounded:
         remarks["bounds.state_lower"] = _guessed_limits(half_bounded, "steady")
     elif unbounded:
         remarks["bounds.state_lower"] = f"CHECK: the FMU states no bound of {', '.join(unbounded)}"
     # An action is sampled between two.
-    open_ended = []
-    for name in plant["actions"]:
-        if not all(map(isfinite, fmu.range(name))):
-            open_ended.append(name)
+    open_ended = _half_bounded(fmu, plant["actions"])
     if open_ended:
         remarks["bounds.action_lower"] = _guessed_limits(open_ended, "start")
     return remarks
+
+
+def _half_bounded(fmu: UnpackedFmu, names: Sequence[str]) -> list[str]:
+    """Those of the variables that the FMU does not bound on both sides."""
+    return [name for name in names if not all(map(isfinite, fmu.range(name)))]
 
 
 def _guessed_limits(names: Sequence[str], value: str) -> str:

@@ -21,6 +21,14 @@ class Terminated(BaseException):
     """SIGTERM or SIGHUP was received; raised so that a command unwinds as it does on Ctrl-C."""
 
 
+class CtrlC(KeyboardInterrupt):
+    """Ctrl-C was pressed.
+
+    Not a plain KeyboardInterrupt: once one has left a text that `exec` runs, as each dataclass
+    does, CPython ends the process by SIGINT at its exit, whatever was caught and returned.
+    """
+
+
 class Interrupted(BaseException):
     """Ctrl-C was pressed, and the command has unwound; its arguments say how it goes on."""
 
@@ -39,11 +47,19 @@ _repeats: list[threading.Timer] = []
 def command_process() -> Iterator[None]:
     """Run a command so that signals unwind it.
 
-    Ctrl-C raises KeyboardInterrupt, SIGTERM and SIGHUP `Terminated`, once. Signals that the caller
-    ignores, as nohup and a shell's background jobs do, stay ignored. Restores the previous
-    handlers; at interpreter shutdown the signals are ignored.
+    Ctrl-C raises `CtrlC`, SIGTERM and SIGHUP `Terminated`, once. Signals that the caller ignores,
+    as nohup and a shell's background jobs do, stay ignored. Restores the previous handlers; at
+    interpreter shutdown the signals are ignored.
     """
     unwound.clear()
+    report_ignored = sys.unraisablehook
+
+    def report(ignored: sys.UnraisableHookArgs) -> None:
+        # Where Python drops ours, in a weak reference's callback say, it is raised once more.
+        if not isinstance(ignored.exc_value, CtrlC | Terminated):
+            report_ignored(ignored)
+
+    sys.unraisablehook = report
     defaults = (signal.SIG_DFL, signal.default_int_handler)
     before = {}
     for number in _SIGNALS:
@@ -62,6 +78,7 @@ def command_process() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
             atexit.register(signal.signal, number, signal.SIG_IGN)
+        sys.unraisablehook = report_ignored
 
 
 def _raise(number: int, _: FrameType | None) -> None:
@@ -86,7 +103,7 @@ def _raise(number: int, _: FrameType | None) -> None:
     timer.daemon = True
     timer.start()
     _repeats.append(timer)
-    raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+    raise CtrlC if number == signal.SIGINT else Terminated
 
 
 @contextmanager

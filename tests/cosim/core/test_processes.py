@@ -125,3 +125,36 @@ def test_a_signal_is_not_raised_once_more_behind_its_command():
     words = [sys.executable, "-c", REPEATED]
     result = subprocess.run(words, capture_output=True, text=True, check=True)
     assert result.stdout == "1\n"
+
+
+CAUGHT = """
+import os, signal, sys, time, weakref
+from cosim.core.processes import command_process
+
+def interrupt(*_):
+    os.kill(os.getpid(), signal.SIGINT)
+
+class Thing:
+    pass
+
+with command_process():
+    try:
+        {where}
+        time.sleep(60.0)
+    except KeyboardInterrupt:
+        print("caught")
+sys.exit(7)
+"""
+WHERE = {
+    "in a text": "exec('interrupt()')",
+    "in a callback": "thing = Thing(); seen = weakref.ref(thing, interrupt); del thing",
+}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("where", WHERE)
+def test_an_interruption_that_is_caught_leaves_the_exit_code(where, tmp_path):
+    (tmp_path / "caught.py").write_text(CAUGHT.format(where=WHERE[where]))
+    words = [sys.executable, "-m", "caught"]
+    result = subprocess.run(words, check=False, cwd=tmp_path, capture_output=True, text=True)
+    assert (result.returncode, result.stdout, result.stderr) == (7, "caught\n", "")

@@ -18,6 +18,7 @@ from cosim.core.scenario import Scenario
 from learning.empirical_model import INTEGRATION_ERROR, EmpiricalModelConfiguration, Features
 from learning.log_configuration import LogConfiguration
 from learning.plant_data import PlantData
+from learning.prediction_errors import estimate_persistence
 
 
 def usable(
@@ -121,6 +122,27 @@ class _Errors(NamedTuple):
         covariance: Array = self.errors.T @ self.errors / len(self.errors)
         return covariance + np.diag(least_variance)
 
+    def without_persistence(
+        self, follows: NDArray[np.bool_], settings: EmpiricalModelConfiguration
+    ) -> _Errors:
+        """What the errors of the transition before do not say: r₊ - Φ r, of those that follow one.
+
+        Args:
+            follows: whether the transition before ends where this one begins, (M,).
+            settings: when errors count as persistent.
+        """
+        later = np.flatnonzero(follows[1:]) + 1
+        before = self.errors[later - 1]
+        persistence = estimate_persistence(
+            self.errors[later],
+            before,
+            np.zeros((self.errors.shape[1], self.errors.shape[1])),
+            n_earlier=0,
+            doubt=settings.persistence_doubt,
+            largest=settings.largest_persistence,
+        )
+        return _Errors(self.errors[later] - before @ persistence.T, self.rounding[later])
+
     def log_likelihood(self) -> float:
         """Of normal errors of mean zero and unknown covariance, but for a constant."""
         count = len(self.errors)
@@ -185,13 +207,20 @@ def _check_order(
         return
     as_it_is = _Reading(data.states[rows], data.actions[rows], data.next_states[rows])
 
-    # A shift leaves the mean error as it is, which is the plant's own.
-    gains = {}
-    centred_likelihood = _nominal_errors(features, as_it_is).centred().log_likelihood()
-    for shift in _shifts(settings.largest_shift):
+    follows = np.diff(rows, prepend=-1) == 1
+
+    def shifted_likelihood(shift: int) -> float:
+        """Of the nominal model where the inputs are those of so many rows later."""
         shifted = as_it_is._replace(actions=data.actions[rows + shift])
+        # A shift leaves the mean error as it is, which is the plant's own.
         errors = _nominal_errors(features, shifted).centred()
-        gains[_in_words(shift)] = errors.log_likelihood() - centred_likelihood
+        # A feedback's inputs say what the errors were: where these persist, what comes.
+        return errors.without_persistence(follows, model_settings).log_likelihood()
+
+    gains = {}
+    likelihood_as_logged = shifted_likelihood(0)
+    for shift in _shifts(settings.largest_shift):
+        gains[_in_words(shift)] = shifted_likelihood(shift) - likelihood_as_logged
     # Exchanged columns have another mean, and may make the model's states stand still: it counts.
     thinning = max(len(rows) // model_settings.fit_samples, 1)
     as_logged = _Reading(*(columns[::thinning] for columns in as_it_is))

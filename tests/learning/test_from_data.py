@@ -8,12 +8,12 @@ from scipy import stats
 
 from controllers.factories import nmpc
 from controllers.problem import Problem
-from cosim import FmuPlant, build_controller, simulate
+from cosim import FmuPlant, Scenario, build_controller, simulate
 from cosim.core.logged_data import LoggedData, LoggedDataError, read_logged_data
 from cosim.core.simulation import indicators_of
 from cosim.core.statistics import mean
 from learning import ConfigurationError, train_from_data
-from learning.empirical_model import EmpiricalModel
+from learning.empirical_model import EmpiricalModel, Features
 from learning.from_data import excitation
 from learning.log_checks import usable
 from learning.log_configuration import LogConfiguration
@@ -264,6 +264,17 @@ def log_of(scenario, controller, samples, folder):
         run = simulate(plant, controller, samples, 0)
         units = plant.units
     return read_logged_data(run.write_csv(folder / "log.csv"), scenario, units=units)
+
+
+def test_inputs_that_follow_lasting_disturbances_are_not_taken_for_early(tmp_path):
+    """A feedback's inputs of the row before tell of a disturbance that is there still."""
+    scenario = Scenario.load("random-coloured-12")
+    data = log_of(scenario, build_controller("lqr", scenario), 3000, tmp_path)
+    features = Features(Problem.from_scenario(scenario), SETTINGS.smallest_error_size)
+    used = usable(data, scenario, features, SETTINGS, LOG)
+    assert len(used) == len(data)
+    with pytest.raises(LoggedDataError, match="inputs are logged 1 row late"):
+        usable(shifted(data, 1), scenario, features, SETTINGS, LOG)
 
 
 @pytest.mark.slow

@@ -18,9 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from controllers import RtiNmpc, compile_functions
+from controllers import compile_functions
 from controllers.errors import OptimumError
-from controllers.factories import nmpc
 from cosim import FmuPlant, Scenario, build_controller, simulate
 from cosim.core.files import temporary_folder, write_atomically
 from cosim.core.logged_data import LoggedDataError
@@ -138,8 +137,7 @@ class Judge:
 
     def costs(self, controller):
         """J of a controller on the held-out seeds, (SEEDS,)."""
-        if isinstance(controller, RtiNmpc):
-            compile_functions(controller, SEEDS * (SAMPLES + BURN_IN))
+        compile_functions(controller, SEEDS * (SAMPLES + BURN_IN))
         costs = []
         for seed in range(HELD_OUT, HELD_OUT + SEEDS):
             values, _ = measure(self.plant, controller, seed, SAMPLES, BURN_IN)
@@ -171,7 +169,8 @@ class Judge:
         costs = self.start_costs
         # θ that is the start's costs what that does.
         if not np.array_equal(answer.learned.theta, answer.start.theta):
-            costs = self.costs(nmpc(self.scenario, answer.learned))
+            learned = answer.learned.save(folder / "learned.toml")
+            costs = self.costs(build_controller(str(learned), self.scenario))
         followed = costs if answer.verdict == "better" else self.start_costs
         row = [
             self.scenario.name,

@@ -339,6 +339,18 @@ class ExtendedKalmanFilter:
         return dict(zip(names, values, strict=True))
 
     @property
+    def parameter_covariance(self) -> Matrix:
+        """Of the error of the uncertain parameters' present estimates, (n_u, n_u)."""
+        first = self._problem.n_states
+        return self._covariance[first : self._n, first : self._n].copy()
+
+    @property
+    def initial_parameter_deviation(self) -> Vector:
+        """Standard deviations of these errors before any reading, (n_u,)."""
+        deviations: Vector = self.model.start_deviation[self._problem.n_states :].copy()
+        return deviations
+
+    @property
     def covariance(self) -> Matrix:
         """Of the present estimate's error, (n, n)."""
         n = self._problem.n_states

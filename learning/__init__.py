@@ -22,7 +22,8 @@ from learning.q_learning import QLearning
 from learning.step import ConstrainedStep, td_step
 
 if TYPE_CHECKING:
-    from learning.from_data import TrainingFromData, train_from_data
+    from learning.from_data import train_from_data
+    from learning.log_answer import TrainingFromData
     from learning.training import Tracker, Training, train
     from learning.training_run import TrainingRun
 
@@ -38,7 +39,8 @@ __all__ = [
 __getattr__, _, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "from_data": ["TrainingFromData", "train_from_data"],
+        "from_data": ["train_from_data"],
+        "log_answer": ["TrainingFromData"],
         "training": ["Tracker", "Training", "train"],
         "training_run": ["TrainingRun"],
     },

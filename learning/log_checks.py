@@ -6,6 +6,7 @@ readings, and the last change of the plant.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations
 from typing import NamedTuple
 
@@ -220,7 +221,7 @@ def _check_order(
     gains = {}
     likelihood_as_logged = shifted_likelihood(0)
     for shift in _shifts(settings.largest_shift):
-        gains[_in_words(shift)] = shifted_likelihood(shift) - likelihood_as_logged
+        gains[shift_in_words(shift)] = shifted_likelihood(shift) - likelihood_as_logged
     # Exchanged columns have another mean, and may make the model's states stand still: it counts.
     thinning = max(len(rows) // model_settings.fit_samples, 1)
     as_logged = _Reading(*(columns[::thinning] for columns in as_it_is))
@@ -244,17 +245,32 @@ def _check_order(
     plant = scenario.plant
     for one, other in combinations(range(len(plant.actions)), 2):
         words = f"columns {plant.actions[one]} and {plant.actions[other]} are exchanged"
-        other_reading = as_logged._replace(actions=_exchanged(as_logged.actions, one, other))
+        other_reading = as_logged._replace(actions=exchanged_columns(as_logged.actions, one, other))
         gains[words] = gain_of(other_reading)
     for one, other in combinations(range(len(plant.states)), 2):
         words = f"columns {plant.states[one]} and {plant.states[other]} are exchanged"
         other_reading = as_logged._replace(
-            states=_exchanged(as_logged.states, one, other),
-            next_states=_exchanged(as_logged.next_states, one, other),
+            states=exchanged_columns(as_logged.states, one, other),
+            next_states=exchanged_columns(as_logged.next_states, one, other),
         )
         gains[words] = gain_of(other_reading)
+    refuse_misreading(gains, settings)
+
+
+def refuse_misreading(
+    gains: Mapping[str, float], settings: LogConfiguration, doubt: float = 0.0
+) -> None:
+    """Raise LoggedDataError where a log speaks for another reading of itself.
+
+    Args:
+        gains: nats by which it does, by the words for the mistake.
+        settings: how many are too many.
+        doubt: how many are not, in any case.
+    """
+    if not gains:
+        return
     best = max(gains, key=lambda words: gains[words])
-    if gains[best] > settings.misreading_evidence:
+    if gains[best] > max(settings.misreading_evidence, doubt):
         raise LoggedDataError(
             f"the log looks as if {best}: the model then explains it better by "
             f"{gains[best]:.0f} nats; correct the file (a dead time of the plant belongs in the "
@@ -310,14 +326,14 @@ def _shifts(largest: int) -> list[int]:
     return shifts
 
 
-def _in_words(shift: int) -> str:
+def shift_in_words(shift: int) -> str:
     """Text about a shift of the inputs."""
     way = "late" if shift > 0 else "early"
     rows = "row" if abs(shift) == 1 else "rows"
     return f"the inputs are logged {abs(shift)} {rows} {way}"
 
 
-def _exchanged(table: Array, one: int, other: int) -> Array:
+def exchanged_columns(table: Array, one: int, other: int) -> Array:
     """A table (M, ·) with two columns exchanged."""
     exchanged = table.copy()
     exchanged[:, [one, other]] = table[:, [other, one]]
@@ -384,25 +400,44 @@ def _there_and_back(
     """
     as_it_is = _Reading(data.states, data.actions, data.next_states)
     nominal = _nominal_errors(features, as_it_is)
-    centre = np.median(nominal.errors, axis=0)
-    distance = np.abs(nominal.errors - centre)
+    least_deviations = nominal.rounding.mean(axis=0)
+    changes = data.next_states - data.states
+    is_jump = np.zeros(len(data), bool)
+    for i, least_deviation in enumerate(least_deviations.tolist()):
+        jumps = jumps_there_and_back(
+            nominal.errors[:, i], least_deviation, changes[:, i], data.follows, settings
+        )
+        for there, back in jumps:
+            is_jump[there : back + 1] = True
+    return is_jump
+
+
+def jumps_there_and_back(
+    errors: Array,
+    least_deviation: float,
+    changes: Array,
+    follows: NDArray[np.bool_],
+    settings: LogConfiguration,
+) -> list[tuple[int, int]]:
+    """Jumps of one quantity that are taken back: the number of each, and of the one back.
+
+    Args:
+        errors: of the model's predictions, (M,).
+        least_deviation: of them.
+        changes: of the quantity, (M,).
+        follows: whether each change begins where the one before ends, (M,).
+        settings: what a jump is.
+    """
+    distance = np.abs(errors - np.median(errors))
     # The median's deviation is not moved by the jumps themselves; of a normal law it is the
     # standard deviation over 1.4826.
-    deviation = 1.4826 * np.median(distance, axis=0)
-    least_deviation = nominal.rounding.mean(axis=0)
-    sizes = distance / np.maximum(deviation, least_deviation)
-    changes = data.next_states - data.states
-
-    jumps = np.zeros(len(data), bool)
-    for i in range(sizes.shape[1]):
-        size = sizes[:, i]
-        change = changes[:, i]
-        candidates = np.flatnonzero(size > settings.jump_size)
-        for there in candidates.tolist():
-            back = _jump_back(there, size, change, data.follows, settings)
-            if back is None:
-                continue
-            jumps[there : back + 1] = True
+    deviation = max(1.4826 * float(np.median(distance)), least_deviation)
+    size = distance / max(deviation, np.finfo(np.float64).tiny)
+    jumps = []
+    for there in np.flatnonzero(size > settings.jump_size).tolist():
+        back = _jump_back(there, size, changes, follows, settings)
+        if back is not None:
+            jumps.append((there, back))
     return jumps
 
 

@@ -30,6 +30,10 @@ class LogConfiguration(BaseModel):
         10.0,
         description="nats by which the log must speak for another reading of itself to be refused",
     )
+    misreading_share: NonNegative = Field(
+        0.005,
+        description="nats for each reading below which it does not speak for one, under sensors",
+    )
     largest_error_ratio: Positive = Field(
         5.0,
         description='times that the nominal model may err as much as "nothing changes" does, '

@@ -234,22 +234,54 @@ def difference(
     if not np.isfinite(others).all():
         return Estimate(-np.inf), 1.0
     differences = costs - others
-    mean_by_model = differences.mean(axis=1)
+    chance = _chance(differences.mean(axis=0), stretches)
+    return _estimate(differences.mean(axis=1), [chance])
+
+
+def difference_of_separate(
+    costs: Array,
+    others: Array,
+    stretches: Sequence[int],
+) -> tuple[Estimate, float]:
+    """The same where the two met disturbances that have nothing to do with each other.
+
+    Args:
+        costs: of D models and T samples, (D, T).
+        others: what is subtracted, of the same models and M samples, (D, M).
+        stretches: numbers of stretches that the samples are parted in.
+    """
+    if not np.isfinite(costs).all():
+        return Estimate(np.inf), 1.0
+    mean_by_model = costs.mean(axis=1) - others.mean(axis=1)
+    chances = []
+    for values in (costs, others):
+        chances.append(_chance(values.mean(axis=0), stretches))
+    return _estimate(mean_by_model, chances)
+
+
+def _estimate(mean_by_model: Array, chances: list[tuple[float, int]]) -> tuple[Estimate, float]:
+    """Mean of the models' differences (D,) with its interval, and the models' share of the doubt.
+
+    Args:
+        mean_by_model: of each model.
+        chances: variances of the mean by the disturbances, with their degrees of freedom.
+    """
     value = float(mean_by_model.mean())
     variance_of_models = float(mean_by_model.var(ddof=1))
-    freedom_of_models = len(costs) - 1
-    mean_by_sample = differences.mean(axis=0)
-    variance_of_chance, freedom_of_chance = _chance(mean_by_sample, stretches)
-
-    variance = variance_of_models + variance_of_chance
-    share = variance_of_models / variance if variance else 0.0
-    # Degrees of freedom of a sum of two variances (Welch and Satterthwaite).
-    part_of_models = share**2 / freedom_of_models
-    part_of_chance = (1.0 - share) ** 2 / freedom_of_chance
-    freedom = 1.0 / (part_of_models + part_of_chance)
-    quantile = float(stdtrit(freedom, 0.5 + LEVEL / 2))
+    sources = [(variance_of_models, len(mean_by_model) - 1), *chances]
+    variance = 0.0
+    for of_source, _ in sources:
+        variance += of_source
+    if not variance:
+        return Estimate(value, (value, value)), 0.0
+    # Degrees of freedom of a sum of variances (Welch and Satterthwaite).
+    parts = 0.0
+    for of_source, freedom in sources:
+        parts += (of_source / variance) ** 2 / freedom
+    quantile = float(stdtrit(1.0 / parts, 0.5 + LEVEL / 2))
     half_width = quantile * variance**0.5
-    return Estimate(value, (value - half_width, value + half_width)), share
+    interval = (value - half_width, value + half_width)
+    return Estimate(value, interval), variance_of_models / variance
 
 
 def _chance(values: Array, stretches: Sequence[int]) -> tuple[float, int]:

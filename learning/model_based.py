@@ -580,6 +580,20 @@ class ExpectedCosts:
         return stage_costs + penalties.sum(axis=0), penalties
 
 
+def one_step_deviation(problem: Problem, model: EmpiricalModel, h: Array) -> Array:
+    """Standard deviation of a state's one-step error, at least a millionth of its own unit, (n,).
+
+    Args:
+        problem: has the units.
+        model: has the errors.
+        h: their sizes at some samples, (M, K).
+    """
+    n = problem.n_states
+    size = h.mean(axis=0)
+    deviation: Array = model.error_deviation[:n] * size[:n]
+    return np.maximum(deviation, 1e-6 * problem.units.state)
+
+
 class BackOffOnModel:
     """Searches back-offs δ (2n,) of the lower, then the upper state bounds on an empirical model.
 
@@ -644,11 +658,7 @@ class BackOffOnModel:
         self._reach = settings.state_ranges * np.ptp(states, axis=0)
         if len(visited) < settings.recent_samples:
             self._reach[:] = np.inf  # the plant has not settled yet
-        # The size of a one-step error, at least a millionth of the state's own unit.
-        size = h.mean(axis=0)
-        deviation = model.error_deviation[:n] * size[:n]
-        deviation = np.maximum(deviation, 1e-6 * problem.units.state)
-        self.unit = np.tile(deviation, 2)
+        self.unit = np.tile(one_step_deviation(problem, model, h), 2)
         distance = problem.state_upper - problem.state_lower
         self._most = np.tile(settings.largest_back_off * distance, 2)
         self.doubt = settings.doubt

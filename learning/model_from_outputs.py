@@ -33,8 +33,14 @@ from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State
 from learning.errors import ConfigurationError
 from learning.gaussian_penalty import expected_penalties_with_errors
-from learning.innovations import fit_noise
+from learning.innovations import Stretch, fit_noise
 from learning.step import update_without_fit
+
+MEND_OF_BIAS = (
+    "name the parameter that may be wrong in the model's `uncertain`, or mend the model "
+    "(`cosim fmu check FMU --model MODEL`)"
+)
+"""What is done about readings that lie to one side of the model's."""
 
 
 class ModelFromOutputs(Algorithm):
@@ -59,10 +65,10 @@ class ModelFromOutputs(Algorithm):
                 f"'{self.scenario.name}' has no estimator of kind 'ekf': leave out estimator.kind "
                 "and noise=false"
             )
-        self._filter = ExtendedKalmanFilter.from_scenario(self.scenario, differentiates=True)
-        self._filter.compile()
-        self._prior_mean = self._filter.noise
-        self._plant = FittedPlant(self.scenario, start, settings.normal_errors)
+        self.filter = ExtendedKalmanFilter.from_scenario(self.scenario, differentiates=True)
+        self.filter.compile()
+        self.prior_mean = self.filter.noise
+        self.plant = FittedPlant(self.scenario, start, settings.normal_errors)
         problem = Problem.from_scenario(self.scenario)
         # Back-offs are searched anew: they are counted from the true bounds.
         true_bounds = {"x_l": problem.state_lower, "x_u": problem.state_upper}
@@ -85,7 +91,7 @@ class ModelFromOutputs(Algorithm):
             if sensor.variable in names:
                 state = names.index(sensor.variable)
                 self._sensors_of_states[state] = i
-        self._errors: list[Array] = [np.empty(0) for _ in names]
+        self.errors: list[Array] = [np.empty(0) for _ in names]
         self._n_seen = 0  # samples whose innovations are among them
         self._count = 0
         self._due = max(settings.first_update, settings.least_samples)
@@ -124,8 +130,8 @@ class ModelFromOutputs(Algorithm):
         self.predicted_cost = np.nan
 
     @property
-    def _data(self) -> tuple[Array, Array]:
-        """Readings (M, n_y) and actions (M, m) of the latest samples, oldest first."""
+    def _data(self) -> Stretch:
+        """The latest samples."""
         size = len(self._rows)
         count = min(self._n_rows, size)
         # The ring as time has it.
@@ -136,59 +142,79 @@ class ModelFromOutputs(Algorithm):
         # What was read before the data begin says nothing of their states.
         for i, delay in enumerate(self._delays):
             readings[:delay, i] = np.nan
-        return readings, actions
+        return Stretch(readings, actions)
 
     def _update(self) -> Update:
         """Fit filter and model, search back-offs, and set θ where that costs less."""
-        settings = self.configuration
         present = self.controller.parameters
-        self._filter.noise = present["noise"]
-        noise, innovations = fit_noise(
-            self._filter,
-            *self._data,
-            self._prior_mean,
-            settings.noise_prior,
-            settings.fit_noise_rounds,
-        )
-        parameters = self._filter.parameters
-        biased = self._biased_sensors(innovations)
+        noise, innovations = self.fit_filter([self._data])
+        biased = self.biased_sensors(innovations)
         if biased:
             # The plant that is fitted has no such error: what it predicts is of another plant.
             warn(
                 f"scenario '{self.scenario.name}': the readings of {', '.join(biased)} are off the "
-                "model's for good, which no noise explains, and θ stays: name the parameter that "
-                "may be wrong in the model's `uncertain`, or mend the model "
-                "(`cosim fmu check FMU --model MODEL`)",
+                f"model's for good, which no noise explains, and θ stays: {MEND_OF_BIAS}",
                 ModelWarning,
             )
             self.predicted_cost = np.nan
             theta = present.theta
             update = update_without_fit(present.blocks, theta, theta, refused=True)
             return update._replace(lost=True)
+        self._keep_errors(innovations)
+        # Of few samples no back-off shrinks.
+        may_shrink = self._n_rows >= self.configuration.shrink_samples
+        best, cost = self.search(noise, may_shrink=may_shrink)
+        self.predicted_cost = cost.mean
+        # Where the best back-offs run away, too, the fitted plant says nothing of any θ.
+        lost = not np.isfinite(cost.mean)
+        if not lost:
+            self.controller.theta = best.theta
+        end = self.controller.theta
+        update = update_without_fit(present.blocks, present.theta, end, refused=lost)
+        return update._replace(lost=lost)
+
+    def fit_filter(self, stretches: Sequence[Stretch]) -> tuple[Vector, Array]:
+        """Fit the filter's variances, from θ's on.
+
+        Args:
+            stretches: the data.
+
+        Returns:
+            η, (q,), and the innovations over their expected deviations, (M, n_y).
+        """
+        settings = self.configuration
+        self.filter.noise = self.controller.parameters["noise"]
+        return fit_noise(
+            self.filter,
+            stretches,
+            self.prior_mean,
+            settings.noise_prior,
+            settings.fit_noise_rounds,
+        )
+
+    def search(self, noise: Vector, *, may_shrink: bool) -> tuple[Parameters, SimulatedCost]:
+        """θ of least cost on the plant that the filter and the errors make, and that cost.
+
+        Args:
+            noise: η of the filter, (q,).
+            may_shrink: whether a back-off may be less than it is.
+        """
+        settings = self.configuration
+        present = self.controller.parameters
+        parameters = self.filter.parameters
         base = self._base.replace({"noise": noise})
         base = _with_parameters(base, parameters)
-        self._keep_errors(innovations)
         seed = int(self.rng.integers(2**63))
-        self._plant.fit(self._filter, parameters, self._errors, seed)
+        self.plant.fit(self.filter, parameters, self.errors, seed)
 
         # The search begins at the present back-offs.
         mean_deviation = self._mean_deviation(base, present)
         start = self._back_offs(present, mean_deviation)
         search = BackOffsBehindFilter(
-            self._plant, base, self._distance, self._reserve, mean_deviation, settings
+            self.plant, base, self._distance, self._reserve, mean_deviation, settings
         )
-        # Of few samples no back-off shrinks.
-        may_shrink = self._n_rows >= settings.shrink_samples
         best = search.best(start, may_shrink)
-        cost = search.cost(best)
-        self.predicted_cost = cost.mean
-        # Where the best back-offs run away, too, the fitted plant says nothing of any θ.
-        lost = not np.isfinite(cost.mean)
-        if not lost:
-            self.controller.theta = search.theta(best).theta
-        end = self.controller.theta
-        update = update_without_fit(present.blocks, present.theta, end, refused=lost)
-        return update._replace(lost=lost)
+        return search.theta(best), search.cost(best)
 
     def _mean_deviation(self, base: Parameters, present: Parameters) -> Vector:
         """What the filter is off in each state, in a rollout at the present bounds, (n,)."""
@@ -196,7 +222,7 @@ class ModelFromOutputs(Algorithm):
             return np.zeros(self._n_bounds // 2)
         bounds = {name: present[name] for name in ("x_l", "x_u", "margin")}
         settings = self.configuration
-        cost = self._plant.run(
+        cost = self.plant.run(
             base.replace(bounds),
             settings.simulated_samples,
             settings.burn_in,
@@ -221,7 +247,7 @@ class ModelFromOutputs(Algorithm):
         mean = constant + factors * np.tile(mean_deviation, 2)
         return np.concatenate([np.maximum(mean, 0.0), factors])
 
-    def _biased_sensors(self, innovations: Array) -> list[str]:
+    def biased_sensors(self, innovations: Array) -> list[str]:
         """Names of the sensors whose readings lie to one side of what the filter expects.
 
         Args:
@@ -244,12 +270,21 @@ class ModelFromOutputs(Algorithm):
         new = innovations[-n_new:]
         self._n_seen = self._count
         capacity = self.configuration.output_samples
-        for state, sensor in self._sensors_of_states.items():
-            of_sensor = new[:, sensor]
-            # Where nothing came there is no innovation.
-            arrived = of_sensor[~np.isnan(of_sensor)]
-            kept = np.concatenate([self._errors[state], arrived])
-            self._errors[state] = kept[-capacity:]
+        for state, arrived in enumerate(self.errors_of_states(new)):
+            kept = np.concatenate([self.errors[state], arrived])
+            self.errors[state] = kept[-capacity:]
+
+    def errors_of_states(self, innovations: Array) -> list[Array]:
+        """Innovations (M, n_y) of each state's own sensor, (M_i,); none of a state without one."""
+        errors = []
+        for state in range(len(self.errors)):
+            arrived = np.empty(0)
+            if state in self._sensors_of_states:
+                of_sensor = innovations[:, self._sensors_of_states[state]]
+                # Where nothing came there is no innovation.
+                arrived = of_sensor[~np.isnan(of_sensor)]
+            errors.append(arrived)
+        return errors
 
     def state_dict(self) -> State:
         """Readings, schedule and prediction; the filter's variances are θ's."""
@@ -261,7 +296,7 @@ class ModelFromOutputs(Algorithm):
             "predicted_cost": self.predicted_cost,
             "n_seen": self._n_seen,
         }
-        for i, errors in enumerate(self._errors):
+        for i, errors in enumerate(self.errors):
             state[f"errors{i}"] = errors
         return state
 
@@ -273,8 +308,24 @@ class ModelFromOutputs(Algorithm):
         self._due = state["due"]
         self.predicted_cost = state["predicted_cost"]
         self._n_seen = state["n_seen"]
-        n_states = len(self._errors)
-        self._errors = [state[f"errors{i}"] for i in range(n_states)]
+        n_states = len(self.errors)
+        self.errors = [state[f"errors{i}"] for i in range(n_states)]
+
+
+class FilteredRollout(NamedTuple):
+    """T samples of a loop behind the filter.
+
+    Attributes:
+        means: of the states, predicted before a sample's readings are taken up, (T, n).
+        variances: of the errors of these, (T, n).
+        costs: stage costs at the estimate, (T,).
+        penalties: expected ones of the lower, then of the upper bounds, (2n, T).
+    """
+
+    means: Array
+    variances: Array
+    costs: Array
+    penalties: Array
 
 
 class SimulatedCost(NamedTuple):
@@ -306,7 +357,7 @@ class FittedPlant:
     Args:
         scenario: model, sensors and penalty.
         parameters: θ, for its blocks.
-        n_normal: weight of a normal law beside the errors that were seen.
+        n_normal: weight of a normal law beside the errors that were seen; it may be set anew.
     """
 
     def __init__(
@@ -326,7 +377,7 @@ class FittedPlant:
         definition = define("fitted", arguments, results)
         self._step = StackedFunction(definition)
         self._scenario = scenario
-        self._n_normal = n_normal
+        self.n_normal = n_normal
         self._model = model
         # The filter's variances are set once for all rollouts: θ need not carry them.
         self._controller = nmpc(scenario, _without_noise(parameters))
@@ -334,6 +385,10 @@ class FittedPlant:
         self._filter = ExtendedKalmanFilter.from_scenario(scenario)
         self._filter.compile()
         self._law = OutputFeedback(self._filter, self._controller)
+        # The same behind a filter whose variances are θ's own, whatever the plant's are.
+        self._own_filter = ExtendedKalmanFilter.from_scenario(scenario)
+        self._own_filter.compile()
+        self._own_law = OutputFeedback(self._own_filter, self._controller)
         self._state: dict[str, Vector] = {}
 
     def fit(
@@ -381,7 +436,7 @@ class FittedPlant:
         n_samples: int,
         burn_in: int,
     ) -> SimulatedCost:
-        """The mean cost of a rollout at θ.
+        """The mean cost of a rollout at θ, behind the filter that fits this plant.
 
         Args:
             theta: θ.
@@ -389,16 +444,49 @@ class FittedPlant:
             burn_in: the first of them, which do not count.
         """
         n = self._scenario.state_lower.size
-        law = self._law
+        rollout = self.rollout(theta, n_samples, burn_in)
+        if rollout is None:
+            return _cost_of_a_failure(n)
+        by_bound = rollout.penalties.mean(axis=1)
+        mean = float(rollout.costs.mean() + by_bound.sum())
+        mean_variance = rollout.variances.mean(axis=0)
+        # Rounding may leave less than nothing of a state that is known.
+        deviation = np.sqrt(np.maximum(mean_variance, 0.0))
+        return SimulatedCost(mean, by_bound, deviation)
+
+    def rollout(
+        self,
+        theta: Parameters,
+        n_samples: int,
+        burn_in: int,
+        own_noise: Vector | None = None,
+    ) -> FilteredRollout | None:
+        """A rollout at θ; None where a QP fails or the loop runs away.
+
+        Costs and penalties are those that the filter that fits the plant expects: one that takes
+        the plant's noise for less than it is would expect too little.
+
+        Args:
+            theta: θ; its block `noise` does not count.
+            n_samples: of the rollout.
+            burn_in: the first of them, which are not returned.
+            own_noise: η of the filter before the controller, (q,); None: the plant's.
+        """
+        n = self._scenario.state_lower.size
         estimator = self._filter
+        law = self._law
+        if own_noise is not None:
+            law = self._own_law
+            self._own_filter.noise = own_noise
         step = self._step
         nominal = self._model.nominal_disturbance
         rng = np.random.default_rng(self._seed)
         sensors = Sensors(self._tables)
         self._controller.parameters = _without_noise(theta)
-        # Forget the last rollout; the filter then stands where the data end.
+        # Forget the last rollout; the filters then stand where the data end.
         law.reset()
-        estimator.load_state_dict(self._state)
+        for one in (estimator, self._own_filter):
+            one.load_state_dict(self._state)
         step.inputs["p"][:] = self._p
         s = estimator.estimate
         readings = self._measured(s)
@@ -406,18 +494,23 @@ class FittedPlant:
         means = np.empty((n_samples, n))
         variances = np.empty((n_samples, n))
         costs = np.empty(n_samples)
+        a = np.empty(0)
         for k in range(n_samples):
             # Else such readings would pass for none that are new, and the estimate for a state.
             if not np.isfinite([*s, *readings]).all():
-                return _cost_of_a_failure(n)
+                return None
             try:
                 law.prepare()
+                if own_noise is not None and k > 0:
+                    estimator.predict(a)
                 # The state of a sample is predicted before its readings are taken up.
                 means[k] = estimator.estimate
                 variances[k] = estimator.covariance.diagonal()
                 a = law.feedback(y).action
+                if own_noise is not None:
+                    estimator.correct(y)
             except QpError:
-                return _cost_of_a_failure(n)
+                return None
             # The cost as a rule under sensors knows it: at the estimate, without noise.
             step.inputs["s"][:] = estimator.estimate
             step.inputs["u"][:] = a
@@ -432,23 +525,19 @@ class FittedPlant:
             s = step.part("x").copy()
             readings = self._measured(s)
             y = sensors.read(k + 1, readings)
+        counted = slice(burn_in, None)
         penalties = expected_penalties_with_errors(
             self._scenario.state_penalty,
-            means[burn_in:],
-            variances[burn_in:],
+            means[counted],
+            variances[counted],
             self._errors,
-            self._n_normal,
+            self.n_normal,
         )
-        by_bound = penalties.mean(axis=1)
-        stage_cost = costs[burn_in:].mean()
-        mean = float(stage_cost + by_bound.sum())
-        mean_variance = variances[burn_in:].mean(axis=0)
+        rollout = FilteredRollout(means[counted], variances[counted], costs[counted], penalties)
         # Of a loop that ran away: NaN would compare as neither more nor less.
-        if not np.isfinite(mean) or not np.isfinite(mean_variance).all():
-            return _cost_of_a_failure(n)
-        # Rounding may leave less than nothing of a state that is known.
-        deviation = np.sqrt(np.maximum(mean_variance, 0.0))
-        return SimulatedCost(mean, by_bound, deviation)
+        if not all(np.isfinite(part).all() for part in rollout):
+            return None
+        return rollout
 
     def _measured(self, s: Vector) -> list[float]:
         """Values of the sensors' variables at a state (n,), (n_y,)."""

@@ -118,7 +118,7 @@ def show_use(summary: dict[str, Any], output: cli.Output) -> None:
     rows = [("rows of the file", str(summary["rows"]))]
     for reason, count in summary["left_out"].items():
         rows.append((f"left out: {reason}", str(count)))
-    rows.append(("transitions used", str(summary["transitions"])))
+    rows.append(("samples used", str(summary["transitions"])))
     output.table("logged data", ("what", "number"), rows)
 
 
@@ -128,7 +128,7 @@ def _show_answer(summary: dict[str, Any], output: cli.Output) -> None:
 
     rows = [("verdict", summary["verdict"])]
     for label, name in (
-        ("J of the log, realised", "J_logged"),
+        ("J of the log", "J_logged"),
         ("J of the log, by the model", "J_logged_by_the_model"),
         ("J of the start, predicted", "J_of_the_start"),
         ("J of the learned θ, predicted", "J_of_the_learned_theta"),
@@ -149,6 +149,10 @@ def _show_answer(summary: dict[str, Any], output: cli.Output) -> None:
             "directions of the model that the log shows",
             f"{summary['directions_shown']} of {len(summary['directions'])}",
         ),
+        (
+            "moves of a bound of θ of which it tells if they cost more",
+            f"{sum(move['is_told'] for move in summary['moves'])} of {len(summary['moves'])}",
+        ),
     ]
     title = f"{summary['algorithm']} from logged data on {summary['scenario']}: {summary['status']}"
     output.table(title, ("per sample, 95 % intervals", "value"), rows)
@@ -164,7 +168,7 @@ def _show_answer(summary: dict[str, Any], output: cli.Output) -> None:
         )
     header = ("parameter or disturbance", "error %", "± %", "shown by the log %")
     output.table("what the log says of the model", header, known)
-    output.note(f"{KNOWN} draws this, and the directions that the log does not show")
+    output.note(f"{KNOWN} draws this, and what the log does not show of model and θ")
     if summary["stage_cost_by_the_model"]:
         output.note("the file has no column stage_cost: the cost is the nominal model's")
     if summary["verdict"] == "better":

@@ -191,7 +191,9 @@ def read_log(
             raise LoggedDataError(
                 f"--column {name}={title}: there is no variable '{name}'{instead(name, names)}"
             )
-    known_units = units or {}
+    known_units = dict(units or {})
+    for signal, sensor in zip(scenario.measurement_names, scenario.sensors or (), strict=True):
+        known_units[signal] = known_units.get(sensor.variable, "")
 
     def column(name: str, missing: Sequence[str] = ("",)) -> Array:
         position = file.position(wanted.get(name, name), name)
@@ -229,13 +231,13 @@ def transitions_of(table: LogTable, scenario: Scenario) -> LoggedData:
         LoggedDataError: the whole log is doubtful.
     """
     check_sampling_time(table, scenario)
-    _check_sizes(table, scenario)
+    check_sizes(table, scenario, scenario.plant.states)
     states_missing = _in_any_column(np.isnan(table.states))
     others = [table.actions]
     if table.stage_cost is not None:
         others.append(table.stage_cost[:, None])
     others_missing = _in_any_column(np.isnan(np.column_stack(others)))
-    beyond = _in_any_column(_beyond(table.actions, scenario))
+    is_beyond = _in_any_column(beyond(table.actions, scenario))
     steps = np.diff(table.time) / scenario.sampling_time
 
     # Reasons in this order; the first one counts. s₊ is of the second row, all else of the first.
@@ -250,7 +252,7 @@ def transitions_of(table: LogTable, scenario: Scenario) -> LoggedData:
     for name, values in zip(scenario.plant.states, table.states.T, strict=True):
         still = standing_still(values)
         reasons[f"{name} frozen or interpolated"] = still[first] | still[second]
-    reasons["input beyond its bounds"] = beyond[first]
+    reasons["input beyond its bounds"] = is_beyond[first]
 
     is_transition = np.ones(len(steps), bool)
     left_out = {}
@@ -331,7 +333,7 @@ def _in_any_column(flags: Flags) -> Flags:
     return rows
 
 
-def _beyond(actions: Array, scenario: Scenario) -> Flags:
+def beyond(actions: Array, scenario: Scenario) -> Flags:
     """Which actions (K, m) lie outside the actuators' bounds, (K, m)."""
     room = BEYOND * (scenario.action_upper - scenario.action_lower)
     below: Flags = actions < scenario.action_lower - room
@@ -353,23 +355,29 @@ def check_sampling_time(table: LogTable, scenario: Scenario) -> None:
         )
 
 
-def _check_sizes(table: LogTable, scenario: Scenario) -> None:
-    """Refuse a column whose values cannot be the variable's: of another unit, or another one."""
-    beyond = _beyond(table.actions, scenario)
+def check_sizes(table: LogTable, scenario: Scenario, given: Sequence[str]) -> None:
+    """Refuse a column whose values cannot be the variable's: of another unit, or another one.
+
+    Args:
+        table: the rows.
+        scenario: has the bounds.
+        given: the variables of which `table.states` has values.
+    """
+    is_beyond = beyond(table.actions, scenario)
     for i, name in enumerate(scenario.plant.actions):
-        share = float(beyond[:, i].mean())
+        share = float(is_beyond[:, i].mean())
         if share > MOST_BEYOND:
             low, high = scenario.limits[name]
             raise LoggedDataError(
                 f"'{table.path}': {name} lies outside its actuator's bounds {low:g} … {high:g} in "
                 f"{100 * share:.0f} % of the rows: another unit, or another variable?"
             )
-    for name, values in zip(scenario.plant.states, table.states.T, strict=True):
+    for name, values in zip(given, table.states.T, strict=True):
         known = values[~np.isnan(values)]
         if not len(known):
             raise LoggedDataError(f"'{table.path}': column of {name} is empty")
         # A penalty bounds states, no actuator: only what is far beyond is refused.
-        low, high = scenario.limits[name]
+        low, high = scenario.limits.get(name, (-np.inf, np.inf))
         middle = float(np.median(known))
         distance = max(low - middle, middle - high)
         if np.isfinite(high - low) and distance > high - low:

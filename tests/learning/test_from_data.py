@@ -14,7 +14,7 @@ from cosim.core.simulation import indicators_of
 from cosim.core.statistics import mean
 from learning import ConfigurationError, train_from_data
 from learning.empirical_model import EmpiricalModel, Features
-from learning.from_data import excitation
+from learning.log_answer import excitation
 from learning.log_checks import usable
 from learning.log_configuration import LogConfiguration
 from learning.log_prediction import Expectation, difference
@@ -231,10 +231,10 @@ def test_a_lost_rollout_leaves_no_interval():
 def test_what_only_follows_from_the_states_excites_nothing(data, paper):
     gains = np.array([[2.0, 0.1], [-1.0, 0.4]])
     feedback = replace(data, actions=200.0 + data.states @ gains.T)
-    assert max(excitation(feedback, paper).values()) < 1e-9
+    assert max(excitation(feedback.states, feedback.actions, paper).values()) < 1e-9
     stepped = feedback.actions.copy()
     stepped[::2, 0] += 6.0
-    free = excitation(replace(feedback, actions=stepped), paper)
+    free = excitation(feedback.states, stepped, paper)
     assert free["P100"] == pytest.approx(3.0 / 300.0, rel=0.1)
     assert free["F200"] < 1e-9
 
@@ -243,7 +243,8 @@ def test_what_only_follows_from_the_states_excites_nothing(data, paper):
     ("algorithm", "name", "words"),
     [
         ("q-learning", "paper", "cannot learn from logged data"),
-        ("model-based", "late", "has sensors"),
+        ("model-based", "late", "has sensors, and the data are LoggedData"),
+        ("batch-q-learning", "late", "has sensors"),
         ("model-based", "prices", "has signals"),
     ],
 )

@@ -19,7 +19,7 @@ from cosim.core.training_options import TrainingOptions
 from learning import train
 from learning.errors import ConfigurationError
 from learning.gaussian_penalty import expected_penalties_with_errors, normal_penalties
-from learning.innovations import fit_noise, replay
+from learning.innovations import Stretch, fit_noise, replay
 from learning.log import to_csv
 from learning.model_based import ModelBasedConfiguration
 from learning.model_from_outputs import BackOffsBehindFilter, FittedPlant, SimulatedCost
@@ -99,7 +99,9 @@ def test_the_variances_that_made_the_data_are_found():
     """Theory: on a linear plant the likelihood is exact, so that its maximiser is consistent."""
     true = np.array([0.6, 2.0])
     estimator, readings, actions = linear_readings(true, 600, 4)
-    noise, innovations = fit_noise(estimator, readings, actions, estimator.noise, 3.0, 15)
+    noise, innovations = fit_noise(
+        estimator, [Stretch(readings, actions)], estimator.noise, 3.0, 15
+    )
     truth = np.log(np.array([*true, 0.02, 0.05]) ** 2)
     assert np.abs(noise[:2] - truth[:2]).max() < 0.3
     # With the right variances the innovations are standard normal.
@@ -114,7 +116,7 @@ def test_a_fit_never_ends_worse_than_where_it_began_or_than_the_prior(rounds):
 
     def loss(noise):
         estimator.noise = noise
-        replay(estimator, readings, actions)
+        replay(estimator, Stretch(readings, actions))
         away = (noise - mean) / 1.0
         return float(away @ away) / 2 - estimator.log_likelihood
 
@@ -122,7 +124,7 @@ def test_a_fit_never_ends_worse_than_where_it_began_or_than_the_prior(rounds):
     start = mean - 3.9
     before = min(loss(start), loss(mean))
     estimator.noise = start
-    noise, _ = fit_noise(estimator, readings, actions, mean, 1.0, rounds)
+    noise, _ = fit_noise(estimator, [Stretch(readings, actions)], mean, 1.0, rounds)
     assert loss(noise) <= before
 
 
@@ -194,17 +196,20 @@ class RunsAway:
         return 100.0 * self.noise[0] if self.noise[0] < 0.5 else np.nan
 
 
+NOTHING = [Stretch(np.zeros((1, 1)), np.zeros((1, 1)))]
+
+
 @pytest.mark.parametrize("start", [-2.0, 0.4])
 def test_variances_with_which_the_filter_runs_away_are_not_the_result(start):
     estimator = RunsAway(start)
-    noise, _ = fit_noise(estimator, np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1), 2.0, 15)
+    noise, _ = fit_noise(estimator, NOTHING, np.zeros(1), 2.0, 15)
     assert start <= noise[0] < 0.5
     assert np.isfinite(estimator.log_likelihood)
 
 
 def test_where_the_filter_runs_away_from_the_start_the_prior_stands_in():
     estimator = RunsAway(0.7)
-    noise, _ = fit_noise(estimator, np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1), 2.0, 15)
+    noise, _ = fit_noise(estimator, NOTHING, np.zeros(1), 2.0, 15)
     assert noise[0] == 0.0
     assert np.isfinite(estimator.log_likelihood)
 

@@ -48,7 +48,8 @@ REFUSED = {
     "variable": (("shadow", "tuned", "--column", "P3=PI-1", "--data"), "no variable 'P3'"),
     "plant": ((*TRAIN[:-1], "--samples", 100, "--data"), "--samples has no part"),
     "rule": (("train", "-a", "q-learning", "--data"), "q-learning cannot learn from logged data"),
-    "sensors": ((*TRAIN[:-1], "--scenario", "late", "--data"), "has sensors"),
+    "sensors": ((*TRAIN[:-1], "--scenario", "late", "--data"), "no column 'measured[X2]'"),
+    "signals": ((*TRAIN[:-1], "--scenario", "prices", "--data"), "has signals"),
 }
 
 

@@ -17,10 +17,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.errors import ModelWarning
 from controllers.estimator import ExtendedKalmanFilter
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim.core.errors import warn
 from cosim.core.logged_data import LoggedDataError
 from cosim.core.logged_readings import LoggedReadings
 from cosim.core.protocols import Array, Vector
@@ -201,6 +203,7 @@ def _fit(rule: ModelFromOutputs, data: LoggedReadings, settings: LogConfiguratio
             f"explains: another unit, or another variable? Else {MEND_OF_BIAS}"
         )
     _check_order(rule, data, innovations, settings)
+    _warn_of_persistence(rule, innovations, settings)
     covariance = noise_covariance(
         rule.filter, stretches, rule.prior_mean, rule.configuration.noise_prior
     )
@@ -291,6 +294,34 @@ def _check_order(
     refuse_misreading(gains, settings, settings.misreading_share * n_readings)
 
 
+def _warn_of_persistence(
+    rule: ModelFromOutputs, innovations: Array, settings: LogConfiguration
+) -> None:
+    """Warn where innovations follow one another: what the model lacks, no interval holds."""
+    names = []
+    for sensor, values in zip(rule.scenario.sensors or (), innovations.T, strict=True):
+        arrived = values[~np.isnan(values)]
+        if len(arrived) < FEWEST_INNOVATIONS:
+            continue
+        if abs(_persistence(arrived - arrived.mean())) > settings.persistent_innovations:
+            names.append(sensor.variable)
+    if names:
+        warn(
+            f"the errors in predicting {', '.join(names)} follow one another: the model lacks "
+            "something, or disturbances last. Of states that no sensor shows its predictions may "
+            "be off by more than their intervals: mend the model (`cosim fmu check FMU --model "
+            "MODEL`) or add a sensor",
+            ModelWarning,
+        )
+
+
+def _persistence(values: Array) -> float:
+    """Share of each value, (M,) of mean zero, that the one before says."""
+    before = values[:-1]
+    later = values[1:]
+    return float(before @ later) / float(before @ before)
+
+
 def _nats(innovations: Array, as_it_is: Array) -> float:
     """By how many nats innovations (M, n_y) speak for another reading than the log as it is."""
     total = 0.0
@@ -312,10 +343,7 @@ def _white(innovations: Array) -> Array:
         if len(arrived) < FEWEST_INNOVATIONS:
             continue
         centred = values[arrived] - values[arrived].mean()
-        before = centred[:-1]
-        later = centred[1:]
-        share = (before @ later) / (before @ before)
-        white[arrived[1:], i] = later - share * before
+        white[arrived[1:], i] = centred[1:] - _persistence(centred) * centred[:-1]
     return white
 
 
@@ -345,6 +373,8 @@ def _predicted_costs(
     rule = fit.rule
     settings = rule.configuration
     data = fit.data
+    by_model = _stage_costs(rule, fit.followed.estimates, data.actions)
+    stage_costs = by_model if data.stage_cost is None else data.stage_cost
     plant = FittedPlant(rule.scenario, thetas[0], settings.normal_errors)
     # All plants and all θ meet the same noise.
     seed = int(rng.integers(2**63))
@@ -377,8 +407,6 @@ def _predicted_costs(
             costs[place][number] = rollout.costs + rollout.penalties.sum(axis=0)
             if place == 0:
                 outside.append(_share_outside(rollout, followed.estimates))
-    by_model = _stage_costs(rule, fit.followed.estimates, data.actions)
-    stage_costs = by_model if data.stage_cost is None else data.stage_cost
     return _Costs(
         thetas=costs,
         logged=stage_costs + penalties,
@@ -392,6 +420,8 @@ def _drawn_parameters(
 ) -> dict[str, float]:
     """The uncertain parameters as they may be at a filter's last sample."""
     parameters = estimator.parameters
+    if not parameters:
+        return {}
     mean = list(parameters.values())
     drawn = rng.multivariate_normal(mean, estimator.parameter_covariance)
     return dict(zip(parameters, drawn.tolist(), strict=True))

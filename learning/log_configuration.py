@@ -44,6 +44,11 @@ class LogConfiguration(BaseModel):
         description="mean error that it must have for that, over h: as of disturbances half their "
         "magnitude off",
     )
+    persistent_innovations: Share = Field(
+        0.3,
+        description="share of an error of prediction that the one before says, above which the "
+        "model is called in doubt, under sensors",
+    )
     # what is left out
     jump_size: Positive = Field(
         10.0,

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from cosim.core.logged_readings import readings_of
 from cosim.core.simulation import indicators_of
 from cosim.core.statistics import mean
 from learning import ConfigurationError, train_from_data
-from learning.from_readings import follow
+from learning.from_readings import _warn_of_persistence, follow
 from learning.innovations import Stretch, fit_noise, loss_of_noise, noise_covariance
+from learning.log_configuration import LogConfiguration
 from learning.log_prediction import difference_of_separate
 from tests.learning.test_model_from_outputs import linear_readings
 
@@ -164,3 +166,30 @@ def test_what_is_predicted_of_a_log_is_true(assay, log):
     assert known["noise of sensor P2"].shown > 0.9
     assert abs(known["noise of sensor P2"].change) < 4 * known["noise of sensor P2"].deviation
     assert json.loads(json.dumps(answer.summary()))["verdict"] == answer.verdict
+
+
+@pytest.mark.slow
+def test_a_model_without_doubt_is_fitted_by_its_noises_alone(assay, log):
+    certain = assay.replace({"estimator": {"parameter_drift": 0.0}})
+    answer = train_from_data(
+        "model-based",
+        log,
+        certain,
+        start="cautious",
+        settings=QUICK,
+        log_settings={"drawn_models": 2},
+    )
+    assert all(one.name.startswith("noise of") for one in answer.known.parameters)
+    assert np.isfinite(answer.learned_cost)
+
+
+@pytest.mark.parametrize(("persistence", "warns"), [(0.0, False), (0.6, True)])
+def test_innovations_that_follow_one_another_are_told(assay, rng, recwarn, persistence, warns):
+    innovations = rng.standard_normal((600, 2))
+    for k in range(1, 600):
+        innovations[k, 1] += persistence * innovations[k - 1, 1]
+    rule = SimpleNamespace(scenario=assay)
+    _warn_of_persistence(rule, innovations, LogConfiguration())
+    told = [str(warning.message) for warning in recwarn]
+    assert bool(told) == warns
+    assert all("in predicting P2 follow one another" in message for message in told)

@@ -149,7 +149,7 @@ def read_logged_data(
         path: of the CSV file, whose header names its columns: `NAME` or `NAME [unit]`.
         scenario: names the variables, and has their bounds and the sampling time.
         columns: the file's name of a column by ours, where they differ: of a state, an action,
-            `time` or `stage_cost`.
+            `time` or `stage_cost`; before those of the scenario's table `[log]`.
         units: unit of each variable by name; a column that states another one is refused.
         leave_out: `COLUMN=VALUE` each: rows with that text in that column are left out.
 
@@ -185,12 +185,14 @@ def read_log(
     missing = ("", "nan") if states != scenario.plant.states else ("",)
     actions = scenario.plant.actions
     names = (TIME, *states, *actions, STAGE_COST)
-    wanted = dict(columns or {})
-    for name, title in wanted.items():
+    for name, title in (columns or {}).items():
         if name not in names:
             raise LoggedDataError(
                 f"--column {name}={title}: there is no variable '{name}'{instead(name, names)}"
             )
+    # What is asked for goes before what the scenario says.
+    of_scenario = scenario.log.columns if scenario.log else {}
+    wanted = {**of_scenario, **(columns or {})}
     known_units = dict(units or {})
     for signal, sensor in zip(scenario.measurement_names, scenario.sensors or (), strict=True):
         known_units[signal] = known_units.get(sensor.variable, "")

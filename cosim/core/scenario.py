@@ -221,6 +221,14 @@ class EstimatorTable(Table):
     controller's model, as a share of its nominal value; 0 takes the parameters as they are."""
 
 
+class LogColumnsTable(Table):
+    """A log of the plant, from which a controller learns (`cosim train --data`)."""
+
+    columns: dict[str, Name]
+    """The file's name of a column by ours: of a state, of a sensor (`measured[X2]`), of an action,
+    of `time` or `stage_cost`. A column that is left out has our name."""
+
+
 class SignalTable(Table):
     """A signal: what moves with time, what it moves, and what a controller knows of it.
 
@@ -495,6 +503,8 @@ class Scenario(Shown, Table):
         tuple[SignalTable, ...] | None, Field(alias="signal", min_length=1, strict=False)
     ] = None
     """Tables `[[signal]]`: what moves with time."""
+    log: LogColumnsTable | None = None
+    """Table `[log]`: the columns of a log; it does not count in the hash."""
 
     @model_validator(mode="after")
     def _sizes_and_signs_fit(self) -> Self:
@@ -503,6 +513,7 @@ class Scenario(Shown, Table):
         self._check_times()
         self._check_sensors()
         self._check_signals()
+        self._check_log()
         plant = self.plant
         names = (*plant.states, *plant.actions, *plant.disturbances)
         for name in names:
@@ -594,6 +605,18 @@ class Scenario(Shown, Table):
         for time, next_time in pairwise(times):
             if time >= next_time:
                 raise ValueError("plant.changes: must have increasing times")
+
+    def _check_log(self) -> None:
+        """Raise ValueError where a column is named of what no log has."""
+        if self.log is None:
+            return
+        plant = self.plant
+        names = ("time", "stage_cost", *plant.states, *plant.actions, *self.measurement_names)
+        for name in self.log.columns:
+            if name not in names:
+                raise ValueError(
+                    f"log.columns: there is no variable '{name}'{instead(name, names)}"
+                )
 
     def _check_sensors(self) -> None:
         """Raise ValueError where two sensors read one variable, or an estimator has none."""
@@ -775,10 +798,11 @@ class Scenario(Shown, Table):
     def hash(self) -> str:
         """First 16 hex digits of the SHA-256 of all that bears on results.
 
-        Left out: name, description, and the folder of a foreign FMU (its file name counts). Time
-        constants that are all zero are none.
+        Left out: name, description, the columns of a log, and the folder of a foreign FMU (its file
+        name counts). Time constants that are all zero are none.
         """
         document = self.to_dict()
+        document.pop("log", None)
         plant = document["plant"]
         del document["name"]
         del document["description"]

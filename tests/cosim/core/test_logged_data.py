@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim import FmuPlant, build_controller, simulate
+from cosim.core.errors import ScenarioError
 from cosim.core.logged_data import LoggedDataError, read_logged_data, standing_still
 
 UNITS = {"X2": "%", "P2": "kPa", "P100": "kPa", "F200": "kg/min"}
@@ -77,6 +78,22 @@ def test_the_order_of_columns_does_not_count(columns, read):
 def test_columns_of_other_names_are_mapped(columns, read):
     renamed = {"PI-101" if name == "P2" else name: values for name, values in columns.items()}
     assert np.array_equal(read(renamed, columns={"P2": "PI-101"}).states, read(columns).states)
+
+
+def test_the_scenario_may_name_the_columns(columns, tmp_path, paper):
+    named = paper.replace({"log": {"columns": {"P2": "PI-101", "X2": "AI-7"}}})
+    assert named.hash == paper.hash
+    path = write(tmp_path / "log.csv", columns, {"P2": "PI-101", "X2": "AI-7"})
+    assert np.array_equal(read_logged_data(path, named).states[:, 1], columns["P2"][:-1])
+    # What is asked for goes before it.
+    path = write(tmp_path / "log.csv", columns, {"P2": "PI-101", "X2": "AI-8"})
+    data = read_logged_data(path, named, columns={"X2": "AI-8"})
+    assert np.array_equal(data.states[:, 0], columns["X2"][:-1])
+
+
+def test_a_scenario_that_names_a_column_of_nothing_is_refused(paper):
+    with pytest.raises(ScenarioError, match=r"log\.columns: there is no variable 'P3'"):
+        paper.replace({"log": {"columns": {"P3": "PI-101"}}})
 
 
 def test_a_gap_is_no_transition(columns, read):

@@ -33,7 +33,6 @@ from learning.errors import ConfigurationError, DivergenceError
 from learning.exploration import Strategy
 from learning.from_readings import train_from_readings
 from learning.log_answer import (
-    BoundMove,
     Known,
     KnownParameter,
     TrainingFromData,
@@ -41,6 +40,7 @@ from learning.log_answer import (
     directions_of,
     excitation,
     moved_bounds,
+    moves_of,
 )
 from learning.log_checks import inputs_and_outputs, usable
 from learning.log_configuration import LogConfiguration
@@ -192,7 +192,7 @@ def _train(
     _, h, _ = model.predict(inputs)
     deviation = one_step_deviation(problem, model, h)
     moved = moved_bounds(learned, problem, deviation)
-    thetas = [theta, start.theta, *(one.theta for _, _, one in moved)]
+    thetas = [theta, start.theta, *(one.theta.theta for one in moved)]
     costs = prediction.costs(thetas, log_settings.drawn_models, rng)
     of_learned, of_start, *of_moved = costs.thetas
     realised = outputs[:, -1] + run.scenario.state_penalty.along(data.states)
@@ -200,10 +200,7 @@ def _train(
     against_start, start_share = difference(of_learned, of_start, stretches)
     against_logged, logged_share = difference(of_learned, costs.logged, stretches)
     start_against_logged, _ = difference(of_start, costs.logged, stretches)
-    moves = []
-    for (bound, step, _), of_one in zip(moved, of_moved, strict=True):
-        estimate, _ = difference(of_one, of_learned, stretches)
-        moves.append(BoundMove(bound, step, estimate.value, estimate.interval))
+    moves = moves_of(moved, of_moved, of_learned, stretches)
     return TrainingFromData(
         run=run,
         log_settings=log_settings,
@@ -220,7 +217,7 @@ def _train(
         start_against_logged=start_against_logged,
         model_share=decisive_share((against_start, start_share), (against_logged, logged_share)),
         known=_known(problem, model, settings),
-        moves=tuple(moves),
+        moves=moves,
         excitation=excitation(data.states, data.actions, run.scenario),
         cost_is_modelled=cost_is_modelled,
         outside=costs.outside,

@@ -30,14 +30,15 @@ from learning.exploration import Strategy
 from learning.gaussian_penalty import expected_penalties_with_errors
 from learning.innovations import Stretch, noise_covariance
 from learning.log_answer import (
-    BoundMove,
     Known,
     KnownParameter,
     TrainingFromData,
     decisive_share,
     directions_of,
     excitation,
+    is_same_cost,
     moved_bounds,
+    moves_of,
 )
 from learning.log_checks import (
     exchanged_columns,
@@ -156,17 +157,14 @@ def train_from_readings(
         learned = start
 
     moved = moved_bounds(learned, problem, cost.deviation)
-    thetas = [learned, start, *(theta for _, _, theta in moved)]
+    thetas = [learned, start, *(one.theta for one in moved)]
     costs = _predicted_costs(fit, thetas, log_settings.drawn_models, rng)
     of_learned, of_start, *of_moved = costs.thetas
     parts = log_settings.stretches
     against_start, start_share = difference(of_learned, of_start, parts)
     against_logged, logged_share = difference_of_separate(of_learned, costs.logged, parts)
     start_against_logged, _ = difference_of_separate(of_start, costs.logged, parts)
-    moves = []
-    for (bound, step, _), of_one in zip(moved, of_moved, strict=True):
-        estimate, _ = difference(of_one, of_learned, parts)
-        moves.append(BoundMove(bound, step, estimate.value, estimate.interval))
+    moves = moves_of(moved, of_moved, of_learned, parts)
     return TrainingFromData(
         run=run,
         log_settings=log_settings,
@@ -183,7 +181,7 @@ def train_from_readings(
         start_against_logged=start_against_logged,
         model_share=decisive_share((against_start, start_share), (against_logged, logged_share)),
         known=known,
-        moves=tuple(moves),
+        moves=moves,
         excitation=excitation(fit.followed.estimates, fit.data.actions, scenario),
         cost_is_modelled=fit.data.stage_cost is None,
         outside=costs.outside,
@@ -384,6 +382,8 @@ def _predicted_costs(
         costs.append(np.full((count, n_samples - settings.burn_in), np.inf))
     penalties = np.empty((count, len(data)))
     outside = []
+    # A θ that differs from the first one by a bound out of reach, which costs the same.
+    alike = set()
     for number in range(count):
         rule.filter.noise = rng.multivariate_normal(fit.noise, fit.covariance)
         followed = follow(rule.filter, fit.stretches)
@@ -401,12 +401,17 @@ def _predicted_costs(
         parameters = _drawn_parameters(rule.filter, rng)
         plant.fit(rule.filter, parameters, errors, seed)
         for place, theta in enumerate(thetas):
+            if place in alike:
+                costs[place][number] = costs[0][number]
+                continue
             rollout = plant.rollout(theta, n_samples, settings.burn_in, theta["noise"])
             if rollout is None:
                 continue
             costs[place][number] = rollout.costs + rollout.penalties.sum(axis=0)
             if place == 0:
                 outside.append(_share_outside(rollout, followed.estimates))
+            elif number == 0 and is_same_cost(costs[place][0], costs[0][0]):
+                alike.add(place)
     return _Costs(
         thetas=costs,
         logged=stage_costs + penalties,

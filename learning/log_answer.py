@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -17,6 +17,7 @@ from cosim.core.result import Shown
 from cosim.core.scenario import Scenario
 from cosim.core.statistics import Estimate, shown
 from learning.log_configuration import LogConfiguration
+from learning.log_prediction import difference
 from learning.training_run import TrainingRun
 
 LogVerdict = Literal["better", "cannot tell"]
@@ -115,7 +116,8 @@ class TrainingFromData(Shown):
         model_share: share of the variance that comes from what the log does not say of the plant,
             of the difference that is shown least; the rest is the chance of its disturbances.
         known: what the log says of the model.
-        moves: what moving each bound of the learned θ is predicted to cost, either way.
+        moves: what moving each bound of the learned θ is predicted to cost, either way; of those
+            that are in reach.
         excitation: of each action, the part of its standard deviation that does not follow from
             the states, as a share of its range.
         cost_is_modelled: whether the stage cost is the model's, since it was not logged.
@@ -303,10 +305,22 @@ def directions_of(left: Array) -> tuple[Direction, ...]:
     return tuple(directions)
 
 
-def moved_bounds(
-    theta: Parameters, problem: Problem, deviation: Vector
-) -> list[tuple[str, float, Parameters]]:
-    """θ with one of its state bounds moved, either way: which bound, by how much, and θ.
+class MovedBound(NamedTuple):
+    """θ with one of its state bounds moved.
+
+    Attributes:
+        bound: its state and side, `X2 ≥` say.
+        by: how far it moves, in the state's unit.
+        theta: θ.
+    """
+
+    bound: str
+    by: float
+    theta: Parameters
+
+
+def moved_bounds(theta: Parameters, problem: Problem, deviation: Vector) -> list[MovedBound]:
+    """θ with one of its state bounds moved, each either way.
 
     Args:
         theta: θ.
@@ -324,5 +338,33 @@ def moved_bounds(
                 bounds = theta[block].copy()
                 bounds[i] += step
                 words = f"{quantity.name} {sign}"
-                moved.append((words, step, theta.replace({block: bounds})))
+                moved.append(MovedBound(words, step, theta.replace({block: bounds})))
     return moved
+
+
+def moves_of(
+    moved: Sequence[MovedBound],
+    costs: Sequence[Array],
+    of_learned: Array,
+    stretches: Sequence[int],
+) -> tuple[BoundMove, ...]:
+    """What moving each bound is predicted to cost; one out of reach, which costs nothing, is not.
+
+    Args:
+        moved: the bounds.
+        costs: of D models and T samples with each, (D, T).
+        of_learned: the same of the learned θ, (D, T).
+        stretches: numbers of stretches that the samples are parted in.
+    """
+    moves = []
+    for one, of_one in zip(moved, costs, strict=True):
+        if is_same_cost(of_one, of_learned):
+            continue
+        estimate, _ = difference(of_one, of_learned, stretches)
+        moves.append(BoundMove(one.bound, one.by, estimate.value, estimate.interval))
+    return tuple(moves)
+
+
+def is_same_cost(one: Array, other: Array) -> bool:
+    """Whether costs are equal but for rounding: a bound that is out of reach was moved."""
+    return bool(np.allclose(one, other, rtol=1e-9, atol=0.0))

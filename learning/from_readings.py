@@ -28,7 +28,7 @@ from cosim.core.logged_readings import LoggedReadings
 from cosim.core.protocols import Array, Vector
 from learning.exploration import Strategy
 from learning.gaussian_penalty import expected_penalties_with_errors
-from learning.innovations import Stretch, noise_covariance
+from learning.innovations import REACH, Stretch, noise_covariance
 from learning.log_answer import (
     Known,
     KnownParameter,
@@ -202,6 +202,7 @@ def _fit(rule: ModelFromOutputs, data: LoggedReadings, settings: LogConfiguratio
         )
     _check_order(rule, data, innovations, settings)
     _warn_of_persistence(rule, innovations, settings)
+    _warn_of_noise(rule, noise)
     covariance = noise_covariance(
         rule.filter, stretches, rule.prior_mean, rule.configuration.noise_prior
     )
@@ -311,6 +312,20 @@ def _warn_of_persistence(
             "MODEL`) or add a sensor",
             ModelWarning,
         )
+
+
+def _warn_of_noise(rule: ModelFromOutputs, noise: Vector) -> None:
+    """Warn where a noise's deviation would be larger than the fit may make it."""
+    most = REACH * rule.configuration.noise_prior
+    away = noise - rule.prior_mean
+    for label, of_one in zip(rule.filter.noise_labels, away.tolist(), strict=True):
+        if of_one > 0.999 * most:
+            warn(
+                f"the log shows a deviation of {label} of {np.exp(most / 2):.2g} times what is "
+                "expected, or more: costs that are predicted with it are too low; state it in the "
+                "scenario ([estimator] disturbance_deviation or sensor_deviation)",
+                ModelWarning,
+            )
 
 
 def _persistence(values: Array) -> float:

@@ -18,6 +18,9 @@ import numpy as np
 from controllers.estimator import ExtendedKalmanFilter
 from cosim.core.protocols import Array, Vector
 
+REACH = 4.0
+"""Deviations of the prior within which variances are fitted: a filter beyond them overflows."""
+
 
 class Stretch(NamedTuple):
     """M samples of a plant, one after the other.
@@ -111,9 +114,9 @@ def fit_noise(
     """
     from scipy.optimize import Bounds, minimize  # noqa: PLC0415 - half a second
 
-    # Four deviations of the prior: a filter beyond them overflows. A θ file may be from far away.
-    least = prior_mean - 4.0 * prior_width
-    most = prior_mean + 4.0 * prior_width
+    # A θ file may be from far away.
+    least = prior_mean - REACH * prior_width
+    most = prior_mean + REACH * prior_width
     start = np.clip(estimator.noise, least, most)
     # The method may end at a point that is worse than its start, where a line search has failed.
     best: Vector = start

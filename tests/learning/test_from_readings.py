@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from controllers.errors import ModelWarning
 from controllers.estimator import ExtendedKalmanFilter
 from cosim import FmuPlant, Scenario, build_controller, simulate
 from cosim.core.logged_data import LoggedDataError, read_log
@@ -14,7 +15,7 @@ from cosim.core.logged_readings import readings_of
 from cosim.core.simulation import indicators_of
 from cosim.core.statistics import mean
 from learning import ConfigurationError, train_from_data
-from learning.from_readings import _warn_of_persistence, follow
+from learning.from_readings import _warn_of_noise, _warn_of_persistence, follow
 from learning.innovations import Stretch, fit_noise, loss_of_noise, noise_covariance
 from learning.log_configuration import LogConfiguration
 from learning.log_prediction import difference_of_separate
@@ -193,3 +194,18 @@ def test_innovations_that_follow_one_another_are_told(assay, rng, recwarn, persi
     told = [str(warning.message) for warning in recwarn]
     assert bool(told) == warns
     assert all("in predicting P2 follow one another" in message for message in told)
+
+
+def test_a_noise_that_the_fit_may_not_make_larger_is_told(assay):
+    estimator = ExtendedKalmanFilter.from_scenario(assay)
+    prior = SimpleNamespace(noise_prior=0.5)
+    rule = SimpleNamespace(filter=estimator, prior_mean=estimator.noise, configuration=prior)
+    noise = estimator.noise
+    # Smaller than may be is no harm: the prior's own deviation is then too large.
+    noise[0] -= 2.0
+    noise[1] += 2.0
+    with pytest.warns(
+        ModelWarning, match="of disturbance F1 of 2.7 times what is expected"
+    ) as all_:
+        _warn_of_noise(rule, noise)
+    assert len(all_) == 1

@@ -53,7 +53,7 @@ from learning.training_run import TrainingRun
 
 FEWEST_INNOVATIONS = 20
 """Readings of a sensor below which the spread of its innovations says nothing."""
-LEAST_SHARE = 1e-6
+LEAST_NORMAL_SHARE = 1e-6
 """Of the search's weight of the normal law: above zero for a state of which no error was seen."""
 MOST_ERRORS = 400
 """Innovations of a sensor over which a penalty is expected."""
@@ -404,7 +404,7 @@ def _predicted_costs(
         followed = follow(rule.filter, fit.stretches)
         errors = _errors(rule, followed.innovations, rng)
         # How long the tails are, few errors do not say: between those seen and the search's law.
-        plant.n_normal = settings.normal_errors * rng.uniform(LEAST_SHARE, 1.0)
+        plant.n_normal = settings.normal_errors * rng.uniform(LEAST_NORMAL_SHARE, 1.0)
         by_bound = expected_penalties_with_errors(
             rule.scenario.state_penalty,
             followed.means,

@@ -10,7 +10,7 @@ Source: Ljung, System Identification, 1999, ch. 7 and 10; Gupta and Mehra, IEEE 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,14 +37,12 @@ class Stretch(NamedTuple):
 def replay(
     estimator: ExtendedKalmanFilter,
     stretch: Stretch,
-    seen: Callable[[], None] | None = None,
 ) -> Array:
     """Run a filter over data; it ends at the last sample, after its correction.
 
     Args:
         estimator: the filter, reset here.
         stretch: the data.
-        seen: called at each sample before its readings are taken up.
 
     Returns:
         Innovations over their expected deviations, (M, n_y), NaN where there is no reading.
@@ -56,8 +54,6 @@ def replay(
         # The reset filter stands before the first reading already.
         if k > 0:
             estimator.predict(actions[k - 1])
-        if seen is not None:
-            seen()
         estimator.correct(y)
         standardised[k] = estimator.standardised
     return standardised

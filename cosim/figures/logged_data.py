@@ -46,8 +46,10 @@ def _draw_errors(axes: Axes, known: Sequence[Mapping[str, Any]]) -> None:
     errors = [100 * parameter["change"] for parameter in known]
     deviations = np.array([100 * parameter["deviation"] for parameter in known])
     prior = np.array([100 * parameter["prior_deviation"] for parameter in known])
+    # Two deviations to either side.
     axes.barh(places, 4 * prior, left=-2 * prior, height=1.0, color=REFERENCE, alpha=0.2)
-    axes.errorbar(errors, places, xerr=2 * deviations, fmt="o", color=LEARNED, markersize=3)
+    bars = 2 * deviations
+    axes.errorbar(errors, places, xerr=bars, fmt="o", color=LEARNED, markersize=3)
     axes.axvline(0.0, color=REFERENCE, linewidth=0.8)
     axes.set_yticks(places, [parameter["name"] for parameter in known])
     axes.set_ylim(len(known) - 0.5, -0.5)

@@ -36,7 +36,7 @@ from learning.log_answer import (
     Known,
     KnownParameter,
     TrainingFromData,
-    decisive_share,
+    differences_of,
     directions_of,
     excitation,
     moved_bounds,
@@ -197,10 +197,7 @@ def _train(
     of_learned, of_start, *of_moved = costs.thetas
     realised = outputs[:, -1] + run.scenario.state_penalty.along(data.states)
     stretches = log_settings.stretches
-    against_start, start_share = difference(of_learned, of_start, stretches)
-    against_logged, logged_share = difference(of_learned, costs.logged, stretches)
-    start_against_logged, _ = difference(of_start, costs.logged, stretches)
-    moves = moves_of(moved, of_moved, of_learned, stretches)
+    shown = differences_of(of_learned, of_start, costs.logged, stretches, difference)
     return TrainingFromData(
         run=run,
         log_settings=log_settings,
@@ -212,12 +209,9 @@ def _train(
         modelled_cost=float(costs.logged.mean()),
         start_cost=float(of_start.mean()),
         learned_cost=float(of_learned.mean()),
-        against_logged=against_logged,
-        against_start=against_start,
-        start_against_logged=start_against_logged,
-        model_share=decisive_share((against_start, start_share), (against_logged, logged_share)),
+        **shown._asdict(),
         known=_known(problem, model, settings),
-        moves=moves,
+        moves=moves_of(moved, of_moved, of_learned, stretches),
         excitation=excitation(data.states, data.actions, run.scenario),
         cost_is_modelled=cost_is_modelled,
         outside=costs.outside,

@@ -33,7 +33,7 @@ from learning.log_answer import (
     Known,
     KnownParameter,
     TrainingFromData,
-    decisive_share,
+    differences_of,
     directions_of,
     excitation,
     is_same_cost,
@@ -47,7 +47,7 @@ from learning.log_checks import (
     shift_in_words,
 )
 from learning.log_configuration import LogConfiguration
-from learning.log_prediction import difference, difference_of_separate
+from learning.log_prediction import difference_of_separate
 from learning.model_from_outputs import MEND_OF_BIAS, FilteredRollout, FittedPlant, ModelFromOutputs
 from learning.training_run import TrainingRun
 
@@ -161,10 +161,7 @@ def train_from_readings(
     costs = _predicted_costs(fit, thetas, log_settings.drawn_models, rng)
     of_learned, of_start, *of_moved = costs.thetas
     parts = log_settings.stretches
-    against_start, start_share = difference(of_learned, of_start, parts)
-    against_logged, logged_share = difference_of_separate(of_learned, costs.logged, parts)
-    start_against_logged, _ = difference_of_separate(of_start, costs.logged, parts)
-    moves = moves_of(moved, of_moved, of_learned, parts)
+    shown = differences_of(of_learned, of_start, costs.logged, parts, difference_of_separate)
     return TrainingFromData(
         run=run,
         log_settings=log_settings,
@@ -176,12 +173,9 @@ def train_from_readings(
         modelled_cost=float(costs.logged_by_model.mean()),
         start_cost=float(of_start.mean()),
         learned_cost=float(of_learned.mean()),
-        against_logged=against_logged,
-        against_start=against_start,
-        start_against_logged=start_against_logged,
-        model_share=decisive_share((against_start, start_share), (against_logged, logged_share)),
+        **shown._asdict(),
         known=known,
-        moves=moves,
+        moves=moves_of(moved, of_moved, of_learned, parts),
         excitation=excitation(fit.followed.estimates, fit.data.actions, scenario),
         cost_is_modelled=fit.data.stage_cost is None,
         outside=costs.outside,

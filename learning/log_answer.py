@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -278,14 +278,44 @@ def _upper_end(estimate: Estimate) -> float:
     return np.inf if estimate.interval is None else estimate.interval[1]
 
 
-def decisive_share(*differences: tuple[Estimate, float]) -> float:
-    """The models' share of the doubt, of the difference that is shown least.
+class Differences(NamedTuple):
+    """Predicted differences of J.
+
+    Attributes:
+        against_logged: of the learned θ less the logged operation.
+        against_start: of the learned θ less the start.
+        start_against_logged: of the start less the logged operation.
+        model_share: the models' share of the doubt, of the difference that is shown least.
+    """
+
+    against_logged: Estimate
+    against_start: Estimate
+    start_against_logged: Estimate
+    model_share: float
+
+
+def differences_of(
+    of_learned: Array,
+    of_start: Array,
+    logged: Array,
+    stretches: Sequence[int],
+    from_log: Callable[[Array, Array, Sequence[int]], tuple[Estimate, float]],
+) -> Differences:
+    """Differences of J by the costs that D models predict.
 
     Args:
-        differences: estimates, each with that share.
+        of_learned: of the learned θ, (D, T).
+        of_start: of the start on the same disturbances, (D, T).
+        logged: of the logged operation, (D, M).
+        stretches: numbers of stretches that the samples are parted in.
+        from_log: `difference` where θ meets the log's own disturbances, else
+            `difference_of_separate`.
     """
-    _, share = max(differences, key=lambda difference: _upper_end(difference[0]))
-    return share
+    against_start = difference(of_learned, of_start, stretches)
+    against_logged = from_log(of_learned, logged, stretches)
+    start_against_logged, _ = from_log(of_start, logged, stretches)
+    _, share = max(against_start, against_logged, key=lambda shown: _upper_end(shown[0]))
+    return Differences(against_logged[0], against_start[0], start_against_logged, share)
 
 
 def directions_of(left: Array) -> tuple[Direction, ...]:

@@ -13,6 +13,7 @@ moves κ at the same mean back-off δ, whose constant part is δ − κσ̄ at t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import casadi as ca
@@ -385,11 +386,19 @@ class FittedPlant:
         self._filter = ExtendedKalmanFilter.from_scenario(scenario)
         self._filter.compile()
         self._law = OutputFeedback(self._filter, self._controller)
-        # The same behind a filter whose variances are θ's own, whatever the plant's are.
-        self._own_filter = ExtendedKalmanFilter.from_scenario(scenario)
-        self._own_filter.compile()
-        self._own_law = OutputFeedback(self._own_filter, self._controller)
         self._state: dict[str, Vector] = {}
+
+    @cached_property
+    def _own_filter(self) -> ExtendedKalmanFilter:
+        """A filter whose variances are θ's own, whatever the plant's are."""
+        estimator = ExtendedKalmanFilter.from_scenario(self._scenario)
+        estimator.compile()
+        return estimator
+
+    @cached_property
+    def _own_law(self) -> OutputFeedback:
+        """The controller behind that filter."""
+        return OutputFeedback(self._own_filter, self._controller)
 
     def fit(
         self,
@@ -485,8 +494,9 @@ class FittedPlant:
         self._controller.parameters = _without_noise(theta)
         # Forget the last rollout; the filters then stand where the data end.
         law.reset()
-        for one in (estimator, self._own_filter):
-            one.load_state_dict(self._state)
+        estimator.load_state_dict(self._state)
+        if own_noise is not None:
+            self._own_filter.load_state_dict(self._state)
         step.inputs["p"][:] = self._p
         s = estimator.estimate
         readings = self._measured(s)
@@ -511,15 +521,11 @@ class FittedPlant:
                     estimator.correct(y)
             except QpError:
                 return None
-            # The cost as a rule under sensors knows it: at the estimate, without noise.
-            step.inputs["s"][:] = estimator.estimate
-            step.inputs["u"][:] = a
-            step.inputs["d"][:] = nominal
-            step()
-            costs[k] = step.part("l")[0]
+            costs[k] = self._expected_cost(estimator.estimate, a)
             # The simulated plant itself, which nobody sees but through the sensors.
             draws = rng.standard_normal(nominal.size)
             step.inputs["s"][:] = s
+            step.inputs["u"][:] = a
             step.inputs["d"][:] = nominal + self._deviations * draws
             step()
             s = step.part("x").copy()
@@ -538,6 +544,15 @@ class FittedPlant:
         if not all(np.isfinite(part).all() for part in rollout):
             return None
         return rollout
+
+    def _expected_cost(self, estimate: Vector, a: Vector) -> float:
+        """The stage cost as a rule under sensors knows it: at the estimate, without noise."""
+        step = self._step
+        step.inputs["s"][:] = estimate
+        step.inputs["u"][:] = a
+        step.inputs["d"][:] = self._model.nominal_disturbance
+        step()
+        return float(step.part("l")[0])
 
     def _measured(self, s: Vector) -> list[float]:
         """Values of the sensors' variables at a state (n,), (n_y,)."""

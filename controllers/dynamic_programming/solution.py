@@ -228,6 +228,10 @@ RESTART_PROBABILITY = 1e-9
 come to rest in several places, has one gain. It shifts J* by 1e-10 of itself."""
 
 
+LARGEST_GRID = 200_000
+"""States of a grid beyond which the factorisation of a policy takes hours and many gigabytes."""
+
+
 class GainEstimate(NamedTuple):
     """An estimate of J*: how it was made, its value and interval [lower, upper]."""
 
@@ -290,8 +294,15 @@ def evaluate_policy(
         The smooth part W of the value (G,), the gain, and the distribution (G,).
 
     Raises:
-        OptimumError: The chain cannot be evaluated.
+        OptimumError: The chain cannot be evaluated, or the grid has too many states for it.
     """
+    if grid.size > LARGEST_GRID:
+        sizes = [str(count) for count in grid.shape]
+        raise OptimumError(
+            f"there is no J* of this scenario: its {len(sizes)} states need a grid of "
+            f"{' × '.join(sizes)} = {grid.size} points, and {LARGEST_GRID} can be solved; compare "
+            "with the best θ of a search on the plant"
+        )
     from scipy import sparse  # noqa: PLC0415
     from scipy.sparse.linalg import splu  # noqa: PLC0415
 

@@ -187,3 +187,8 @@ def test_a_plants_own_model_serves_where_the_controllers_lacks_a_parameter():
         PlantProblem.from_scenario(
             Scenario.load("paper").replace({"plant": {"parameters": {"leak": 0.1}}})
         )
+
+
+def test_plant_of_four_states_is_refused_before_hours_of_work():
+    with pytest.raises(OptimumError, match=r"4 states need a grid of .* = 910224 points"):
+        OptimalPolicy.from_scenario(Scenario.load("tanks"))

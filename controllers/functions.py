@@ -316,6 +316,15 @@ _TIES = (
     ("return fmin(x, y);", "return y < x || x != x ? y : x;"),
 )
 
+# gcc 12 has lost what a function of CasADi's stores: inlined in its caller, with the results in
+# arrays of the caller's, at -O2 and -O3. Without this vectorisation, from here to the end of the
+# file, it has not (tests/controllers/export/test_compilers.py).
+_STORES_KEPT = """\
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize ("no-tree-slp-vectorize")
+#endif
+"""
+
 
 def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     """C99 source of the functions; it needs the mathematical library alone.
@@ -342,7 +351,7 @@ def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     source = str(generator.dump())
     for library, interpreter in _TIES:
         source = source.replace(library, interpreter)
-    return _ASKED.sub(_GIVEN, source)
+    return _STORES_KEPT + _ASKED.sub(_GIVEN, source)
 
 
 SWITCH = "COSIM_COMPILE"

@@ -100,6 +100,11 @@ class EmpiricalModelConfiguration(Configuration):
         1e-7,
         description="probability of a window's mean error below which the plant has changed",
     )
+    smallest_change: NonNegative = Field(
+        1e-3,
+        description="mean error, in an output's standard deviations, that is no change however "
+        "exact the model is",
+    )
     suspicion_probability: Share = Field(
         1e-4,
         description="the same for a window that also costs more than predicted",

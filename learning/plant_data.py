@@ -230,6 +230,10 @@ class PlantData:
         # So few independent errors say nothing of their own size.
         if M <= K + 1:
             return False
+        # An output that no disturbance reaches is predicted to its rounding: an error as small as
+        # that is improbable, and no change of the plant.
+        _, outputs = self.present
+        negligible = self.settings.smallest_change * outputs.std(axis=0)
         for window in self.settings.change_windows:
             if window > len(predictions.errors):
                 break
@@ -240,7 +244,9 @@ class PlantData:
             # Of the mean's own noise and of what the model does not know.
             noise = model.mean_error_covariance(window)
             doubt = design @ model.covariance @ design.T
-            squares = mean @ np.linalg.solve(noise + doubt, mean)
+            size = predictions.h[-window:].mean(axis=0)
+            indifference = np.diag((negligible / size) ** 2)
+            squares = mean @ np.linalg.solve(noise + doubt + indifference, mean)
             # T² has an F distribution after this factor, of K and M − K degrees of freedom.
             scale = K * (M - 1)
             statistic = squares * (M - K) / scale

@@ -40,6 +40,24 @@ def test_so_few_independent_errors_show_no_change_however_many_samples(features,
     assert seen == {0.0: True, 0.9995: False}
 
 
+@pytest.mark.parametrize(("share", "seen"), [(1e-5, False), (1e-2, True)])
+def test_an_output_without_errors_shows_no_change_by_its_rounding(features, rng, share, seen):
+    """The cost is known exactly, and then a share of its standard deviation larger."""
+    nominal = np.zeros(features.n_parameters)
+    inputs, outputs = plant_data(features, rng, 240, nominal)
+    y, _, _ = features(inputs, nominal)
+    cost = y[:, -1]
+    outputs[:, -1] = cost
+    outputs[120:, -1] += share * cost.std()
+    data = PlantData(features, SETTINGS)
+    rows = np.zeros((SETTINGS.memory, 7))
+    rows[:240] = np.column_stack([inputs, outputs])
+    data.load_state_dict(data.state_dict() | {"rows": rows, "count": 120})
+    data.fit()
+    data.count = 240
+    assert data.changed(data.predictions()) == seen
+
+
 @pytest.mark.parametrize(("offset", "window"), [(0.0, 0), (0.3, 15)])
 def test_a_change_of_the_plant_is_seen_and_its_absence_not(features, fitted, rng, offset, window):
     data = watched(features, fitted, rng, offset)

@@ -41,6 +41,8 @@ Rows = NDArray[np.intp]
 """Numbers of samples."""
 INTEGRATION_ERROR = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
+LEAST_COMBINATION = 1e-2
+"""Least eigenvalue of the errors' correlation: a combination of outputs errs by a tenth of them."""
 BLOCK = 250
 """Rows of the fit that are factored at a time: as many as fit in a processor's cache."""
 
@@ -80,6 +82,10 @@ class EmpiricalModelConfiguration(Configuration):
         6,
         description="fits, each about the parameters and with the residuals' covariance of the one "
         "before",
+    )
+    parameter_rounds: Count = Field(
+        3,
+        description="fits of the parameters alone before those, which take errors as independent",
     )
     fit_samples: Count = Field(
         2000,
@@ -425,6 +431,7 @@ class _Regression:
         step: int,
         earlier_persistence: Array,
         n_earlier: int,
+        least_variance: Array,
     ) -> tuple[Array, Array]:
         """Residuals e (·, K) with the coefficients `mean`, and what persists of the errors, Φ.
 
@@ -433,6 +440,7 @@ class _Regression:
             step: every so many samples are taken.
             earlier_persistence: Φ of an earlier estimate, (K, K).
             n_earlier: number of its residuals.
+            least_variance: of each output, (K,); one that errs by less has no errors that persist.
         """
         rows = self._samples(step)
         errors = self._errors(mean, rows)
@@ -440,9 +448,11 @@ class _Regression:
         rows_before = rows[follows] - 1
         # Of consecutive samples the errors before are at hand.
         before = errors[rows_before] if step == 1 else self._errors(mean, rows_before)
+        # An output that is known but for its rounding has no errors that could persist.
+        has_errors = errors.var(axis=0) > least_variance
         persistence = estimate_persistence(
-            errors[follows],
-            before,
+            errors[follows] * has_errors,
+            before * has_errors,
             earlier_persistence,
             n_earlier,
             doubt=self._settings.persistence_doubt,
@@ -533,8 +543,7 @@ class EmpiricalModel:
 
         # All fits but the last take every `thinning`-th sample.
         thinning = max(len(inputs) // settings.fit_samples, 1)
-        c = np.zeros(p)
-        y, _, h = features(inputs[::thinning], c)
+        y, _, h = features(inputs[::thinning], np.zeros(p))
         nominal_errors = outputs[::thinning] - y
         # The sizes of the nominal model's errors set the widths of W.
         priors = _priors(nominal_errors, y, features, settings)
@@ -542,12 +551,21 @@ class EmpiricalModel:
         mean_square = (relative**2).mean(axis=0)
         least_variance = INTEGRATION_ERROR**2 * mean_square
 
-        # Φ begins at that of the nominal errors: W, fitted to states that persistent errors have
-        # moved, would take these for its own, and leave none that persist.
+        # Φ begins at that of what the parameters leave, with the slopes of W all but fixed: the
+        # errors of a wrong parameter would persist, and wide slopes, fitted to states that
+        # persistent errors have moved, would take these for their own.
+        independent = np.zeros((K, K))
+        before = (earlier_persistence, len(earlier_residuals), least_variance)
         mean = np.zeros(priors[0].size)
-        covariance = np.zeros((mean.size, mean.size))
-        earlier_errors = (earlier_persistence, len(earlier_residuals))
-        residuals, persistence = regression.residuals(mean, thinning, *earlier_errors)
+        residuals, persistence = regression.residuals(mean, thinning, *before)
+        for _ in range(settings.parameter_rounds):
+            noise = _residual_covariance(residuals, least_variance)
+            design, target = regression.equations(mean[:p], thinning, independent)
+            mean, _, _ = _posterior(design, target, noise, priors[-1:])
+            # Beyond its largest error a parameter means another plant, not a fit.
+            mean[:p] = mean[:p].clip(-largest_error, largest_error)
+            residuals, persistence = regression.residuals(mean, thinning, *before)
+
         steps = [thinning] * (settings.fit_rounds - 1)
         for step in [*steps, 1]:
             # Residuals from before a change help to size the noise of a young regime.
@@ -556,12 +574,10 @@ class EmpiricalModel:
             # In closed loop no slope can be told from what persists: states and actions follow.
             widths = priors[-1:] if persistence.any() else priors
             # Linearised at the present c: a Gauss-Newton step.
-            design, target = regression.equations(c, step, persistence)
+            design, target = regression.equations(mean[:p], step, persistence)
             mean, covariance, _ = _posterior(design, target, noise, widths)
-            # Beyond its largest error a parameter means another plant, not a fit.
-            c = mean[:p].clip(-largest_error, largest_error)
-            mean[:p] = c
-            residuals, persistence = regression.residuals(mean, step, *earlier_errors)
+            mean[:p] = mean[:p].clip(-largest_error, largest_error)
+            residuals, persistence = regression.residuals(mean, step, *before)
 
         return cls(
             features=features,
@@ -693,7 +709,7 @@ class EmpiricalModel:
     @cached_property
     def noise(self) -> Array:
         """Covariance of the residuals, (K, K)."""
-        return np.cov(self.residuals.T)
+        return _without_exact_combinations(np.cov(self.residuals.T))
 
     @property
     def error_covariance(self) -> Array:
@@ -784,7 +800,26 @@ def _residual_covariance(residuals: Array, least_variance: Array) -> Array:
     # A little in any case, since outputs may be multiples of each other.
     missing = np.maximum(least_variance - variance, 1e-9 * variance)
     noise += np.diag(missing)
-    return noise
+    return _without_exact_combinations(noise)
+
+
+def _without_exact_combinations(covariance: Array) -> Array:
+    """Covariance (K, K) in which no combination of outputs is nearly free of errors.
+
+    Where one disturbance moves several states, their errors are nearly multiples of each other. The
+    rest is the model's curvature: it follows the state, and its mean is not zero. As noise it would
+    be so small that it decided the fit.
+    """
+    size = np.sqrt(np.diag(covariance))
+    unit = np.where(size > 0, size, 1.0)
+    correlation = covariance / np.outer(unit, unit)
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    missing = np.maximum(LEAST_COMBINATION - eigenvalues, 0.0)
+    if not missing.any():
+        return covariance
+    added = (vectors * missing) @ vectors.T
+    floored: Array = covariance + added * np.outer(size, size)
+    return floored
 
 
 def _priors(

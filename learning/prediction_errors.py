@@ -383,8 +383,6 @@ def estimate_persistence(
 
     in_own_units = solution / size[:, None] * size
     persistence: Array = in_own_units.T
-    if _alternates(persistence):
-        return np.zeros((K, K))
     radius = max(_radius(persistence), 1e-9)
     shrinkage = min(1.0, largest / radius)
     return persistence * shrinkage
@@ -396,17 +394,6 @@ def _log_determinant(values: Array) -> float:
     floor = 1e-12 * np.eye(len(covariance))
     _, logarithm = np.linalg.slogdet(covariance + floor)
     return float(logarithm)
-
-
-def _alternates(persistence: Array) -> bool:
-    """Whether what persists longest changes its sign from sample to sample.
-
-    A disturbance with a memory keeps its sign. Errors that alternate are those of a wrong gain in a
-    closed loop, which the model has to correct.
-    """
-    eigenvalues = np.linalg.eigvals(persistence)
-    longest = np.abs(eigenvalues).argmax()
-    return bool(eigenvalues[longest].real < 0)
 
 
 def _radius(persistence: Array) -> float:

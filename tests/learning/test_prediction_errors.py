@@ -123,12 +123,6 @@ def test_independent_errors_do_not_persist(rng):
     assert not estimate_persistence(errors[1:], errors[:-1], NONE, 0, doubt=4.0).any()
 
 
-def test_errors_that_alternate_do_not_persist(rng):
-    """As a wrong gain in a closed loop makes them; a disturbance with a memory keeps its sign."""
-    errors = autoregression(rng, 2000, np.diag([-0.4, 0.1]))
-    assert not estimate_persistence(errors[1:], errors[:-1], NONE, 0, doubt=4.0).any()
-
-
 def test_an_earlier_estimate_counts_like_errors_seen_here(rng):
     errors = autoregression(rng, 21, NONE)
     found = estimate_persistence(errors[1:], errors[:-1], PHI, 2000, doubt=4.0)

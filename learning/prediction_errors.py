@@ -332,7 +332,7 @@ def estimate_persistence(
     *,
     doubt: float,
     largest: float = 0.99,
-    smallest: float = 1e-4,
+    smallest: float = 0.03,
 ) -> Array:
     """Φ by least squares; zero where independent errors would look like it.
 

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
+from controllers.model import discretise, economic_cost
+from learning.empirical_model import Features
 from learning.plant_data import PlantData
 from tests.helpers.empirical import SETTINGS, fit
+from tests.helpers.jacketed_tank import jacketed_tank
 
 PARAMETERS = 0.15
 """Prior standard deviation of a parameter's relative error."""
@@ -139,3 +142,28 @@ def test_there_is_no_false_alarm_where_a_plant_is_met_elsewhere_than_before(feat
             data.add(sample(*row))
         alarms += data.changed(data.predictions())
     assert alarms == 0
+
+
+@pytest.mark.parametrize("samples", [120, 480])
+def test_a_wrong_parameter_is_found_where_one_disturbance_moves_all_states(samples):
+    """The errors of the wrong model persist in the closed loop; those of the plant are white."""
+    problem = jacketed_tank()
+    features = Features(problem)
+    rng = np.random.default_rng(1)
+    step = discretise(problem.model, problem.sampling_time, problem.substeps)
+    cost = economic_cost(problem.model)
+    parameters = np.array([0.0697, 1.2])
+    s = np.array([61.0, 80.0])
+    inputs, outputs = [], []
+    for _ in range(samples):
+        a = np.clip(30.0 + 60.0 * (61.0 - s[:1]), 0.0, 80.0)
+        d = rng.uniform([5.0, 15.0], [11.0, 25.0])
+        following = step(s, a, d, parameters).full().ravel()
+        inputs.append([*s, *a])
+        outputs.append([*following, cost(s, a, d, parameters).full().item()])
+        s = following
+    model = fit(features, np.array(inputs), np.array(outputs))
+    assert not model.persistence.any()
+    deviation = np.sqrt(model.covariance[1, 1])
+    assert abs(model.mean[1] + 0.2) < 3.0 * deviation
+    assert deviation < 0.003

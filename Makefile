@@ -35,7 +35,7 @@ build/figures: $(wildcard results/*.toml results/*/*.csv cosim/figures/* cosim/s
 docs: build/figures
 	$(BIN)/python -m mkdocs build --strict --site-dir build/site
 
-# README's picture, from the stored tables; committed, since README is read without a build.
+# The pictures of README and docs/results.md, from the stored tables; committed, since both are read without a build.
 pictures: $(VENV)/installed-dev
 	$(BIN)/python docs/pictures.py
 

@@ -1,10 +1,11 @@
 """Draw the pictures of README and the pages: `python docs/pictures.py`, a minute.
 
-`regret.png` is drawn from the tables in `results/`. Those of examples/teaching.md are drawn from a
-training and from runs that this file makes.
+`regret.png` and those of docs/results.md are drawn from the tables in `results/`. Those of
+examples/teaching.md are drawn from a training and from runs that this file makes.
 """
 
 from pathlib import Path
+from shutil import copyfile
 
 import cosim
 from cosim.core.files import temporary_folder
@@ -12,6 +13,7 @@ from cosim.core.training_options import HELD_OUT
 from cosim.figures.bars import Bar, bars_figure
 from cosim.figures.style import REFERENCE, palette, save
 from cosim.figures.trajectory import overlay_figure
+from cosim.studies.stored import draw_stored
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -30,6 +32,19 @@ UNTRAINED = {
     "backed-off MPC": ("operation-headline", "fixed(start=backed-off)"),
     "cautious MPC": ("operation-headline", "fixed(start=cautious)"),
 }
+
+RESULTS = {
+    "headline-fouled": ("operation-headline", "operation-fouled"),
+    "intercept-fouled": ("operation-intercept", "operation-fouled"),
+    "gains-holdup": ("operation-gains", "operation-holdup"),
+    "plants-jump": ("operation-plants", "operation-jump"),
+    "outsiders-paper": ("outsiders", "regret-paper"),
+    "printed-rule": (
+        "learning",
+        "parameters-paper-printed(value_offset=discounted_exploration=additive)",
+    ),
+}
+"""Study and figure of each picture of docs/results.md."""
 
 
 def regrets(study: str) -> dict[tuple[str, int], float]:
@@ -70,6 +85,17 @@ def draw_regret() -> None:
     save(figure, IMAGES / "regret.png")
 
 
+def draw_results() -> None:
+    """The figures of stored studies that docs/results.md shows, as `cosim results draw` does.
+
+    A clone has no figures of studies, since they follow from the tables.
+    """
+    for name, (study, figure) in RESULTS.items():
+        draw_stored(ROOT / "results", study)
+        drawn = ROOT / "results" / study / "figures" / f"{figure}.svg"
+        copyfile(drawn, IMAGES / f"{name}.svg")
+
+
 def draw_teaching() -> None:
     """A training of Q-learning, and the same disturbances before and after it."""
     training = cosim.train("q-learning", SCENARIO, 20_000, start="tuned", evaluate_every=2000)
@@ -87,4 +113,5 @@ def draw_teaching() -> None:
 
 if __name__ == "__main__":
     draw_regret()
+    draw_results()
     draw_teaching()

@@ -247,6 +247,18 @@ def test_the_numbers_of_weeks_that_cost_more_are_stored():
             assert int(cell) == sum(a > b for a, b in zip(costs, start, strict=True)), key
 
 
+def test_the_runs_in_which_actor_critic_costs_less_are_stored():
+    table = regrets("operation-policy-gradient", "run")
+    counts = []
+    for name in MAIN:
+        learned = table[name, "actor-critic(start=cautious)", WEEK]
+        fixed = table[name, "fixed(start=cautious)", WEEK]
+        counts.append(sum(a < b for a, b in zip(learned, fixed, strict=True)))
+    page = (ROOT / "docs" / "rules" / "actor-critic.md").read_text()
+    first, second, third = counts
+    assert f"It costs less in {first}, {second} and {third} of 10 runs" in page
+
+
 def test_the_readings_of_the_printed_rule_are_stored():
     ((study, _, lines),) = tables_of("finished")
     stored = {row["case"]: row for row in rows(study, "summary") if row["scenario"] == "paper"}

@@ -96,19 +96,21 @@ def _gains(
     """
     cost = indicators["J"].mean(axis=1)
     by_cost = np.argsort(cost, kind="stable")
-    # Of an even number the lower one of both middle runs.
-    median_run = by_cost[(len(cost) - 1) // 2]
+    # Of an even number the mean of both middle runs, as everywhere.
+    first = (len(cost) - 1) // 2
+    middle = by_cost[first : len(cost) // 2 + 1]
 
     def gain(name: str, baseline: Mapping[str, Array]) -> statistics.Estimate:
+        of_median = indicators[name][middle].mean(axis=0)
         # A controller has one run.
-        return statistics.gain(indicators[name][median_run], baseline[name][0])
+        return statistics.gain(of_median, baseline[name][0])
 
     return Gains(
         scenario,
         case,
         n_runs=len(cost),
         ratio=float(tuned["J"].mean() / naive["J"].mean()),
-        cost=float(cost[median_run]),
+        cost=float(cost[middle].mean()),
         over_a=gain("J", naive),
         over_b=gain("J", tuned),
         economic_over_a=gain("economic_cost", naive),

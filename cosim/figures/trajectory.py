@@ -35,6 +35,7 @@ from cosim.figures.style import (
     shown_case,
 )
 
+DOTTED: Any = (0, (1, 1))
 FRAME = 350
 """Milliseconds of an animation's frame."""
 DrawnRun = Any
@@ -48,7 +49,7 @@ def trajectory_figure(
     beside: Sequence[DrawnRun] = (),
     width: float = WIDTH,
 ) -> Figure:
-    """States and inputs with bounds (red) and operating point (grey), disturbances and costs.
+    """States and inputs with bounds (red) and operating point (dotted), disturbances and costs.
 
     States and inputs have the controller's colour; inputs, disturbances and costs hold from one
     sample to the next. Violated bounds are shaded, fallback actions marked; a bound far from the
@@ -66,18 +67,15 @@ def trajectory_figure(
     # Left the states and inputs with their bounds, right what acts on the plant, and the costs.
     left = [*scenario.limits]
     right = [*scenario.plant.disturbances, *cost_colors]
+    columns = [left, right]
+    # Panels on the right may be a little lower than those of the loop.
+    n_rows = max(len(left), len(right) * 0.8)
     if width < NARROW:
-        mosaic: list[Any] = [[name] for name in (*left, *right)]
-        ratios = [1.0]
-        n_rows = 0.8 * len(mosaic)
-    else:
-        mosaic = _mosaic(left, right)
-        ratios = [1.35, 1.0]
-        # Panels on the right may be a little lower than those of the loop.
-        n_rows = max(len(left), len(right) * 0.8)
+        columns = [[*left, *right]]
+        n_rows = 0.8 * len(columns[0])
     height = max(1.05 * n_rows, 2.4) + 0.7
     with figure(height, width) as drawn:
-        panels = drawn.subplot_mosaic(mosaic, sharex=True, width_ratios=ratios)
+        panels = _panel_columns(drawn, columns)
         for name, axes in panels.items():
             signal_unit = trajectory.signals[name].unit
             axes.set_ylabel(label(name, signal_unit), fontsize=7.0)
@@ -105,25 +103,38 @@ def trajectory_figure(
         end = time[-1] + last_step
         # All panels share their abscissa.
         panels[left[0]].set_xlim(time[0], end)
-        drawn.align_ylabels()
+        for names in columns:
+            drawn.align_ylabels([panels[name] for name in names])
         ask(
             drawn,
-            "Does the loop keep its bounds, and what does it cost?",
+            "Does the loop keep its bounds?",
             _detail(trajectory, scenario),
         )
     return drawn
 
 
-def _mosaic(left: Sequence[str], right: Sequence[str]) -> list[Any]:
-    """Names of the panels of two columns, row by row, each column as high as the other."""
-    # As many rows as both numbers of panels divide: a panel has several of them.
-    n_rows = int(np.lcm(len(left), len(right)))
-    rows = []
-    for row in range(n_rows):
-        left_panel = left[row * len(left) // n_rows]
-        right_panel = right[row * len(right) // n_rows]
-        rows.append([left_panel, right_panel])
-    return rows
+def _panel_columns(drawn: Figure, columns: Sequence[Sequence[str]]) -> dict[str, Axes]:
+    """Panels by name in one or two columns, of which each is as high as the other.
+
+    Args:
+        drawn: the figure.
+        columns: names of the panels of each column, from above; the first one is wider.
+    """
+    ratios = [1.35, 1.0][: len(columns)]
+    outer = drawn.add_gridspec(1, len(columns), width_ratios=ratios)
+    panels: dict[str, Axes] = {}
+    shared: Axes | None = None
+    for place, names in enumerate(columns):
+        # A grid of its own: in a common one, panels of both would reach over several rows, and
+        # the layout of some versions of matplotlib leaves them no height.
+        grid = outer[place].subgridspec(len(names), 1)
+        for row, name in enumerate(names):
+            axes = drawn.add_subplot(grid[row], sharex=shared)
+            # Times stand below the lowest panel of a column.
+            axes.tick_params(labelbottom=name == names[-1])
+            shared = shared or axes
+            panels[name] = axes
+    return panels
 
 
 def _span(axes: Axes, time: float, values: Array) -> None:
@@ -163,7 +174,13 @@ def _loop_panels(
         if not moving:
             lower, upper = scenario.limits[name]
             _limits(axes, lower, upper)
-        axes.axhline(reference, color=REFERENCE, linewidth=0.7)
+        axes.axhline(
+            reference,
+            color=REFERENCE,
+            linewidth=0.7,
+            linestyle=DOTTED,
+            label="operating point",
+        )
         _draw_known(axes, time, trajectory, name)
         if name in scenario.plant.actions and failed.any():
             axes.plot(
@@ -174,7 +191,7 @@ def _loop_panels(
                 markersize=4,
                 label="fallback",
             )
-            axes.legend(loc="upper right")
+    _draw_marks_legend([panels[name] for name in scenario.limits])
 
 
 def _draw_known(axes: Axes, time: Array, trajectory: DrawnRun, name: str) -> None:
@@ -202,19 +219,29 @@ def _draw_known(axes: Axes, time: Array, trajectory: DrawnRun, name: str) -> Non
             markersize=2.5,
             label="measured",
         )
-    # Above the panel, where no line runs.
-    axes.legend(
+
+
+def _draw_marks_legend(panels: Sequence[Axes]) -> None:
+    """Name what is drawn in several panels once, above the first one and its far bounds."""
+    handles: dict[str, Any] = {}
+    for axes in panels:
+        for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(name, handle)
+    panels[0].legend(
+        handles=list(handles.values()),
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
-        ncols=2,
+        ncols=len(handles),
         fontsize=6.0,
-        borderaxespad=0.2,
+        borderaxespad=1.6,
+        handlelength=1.6,
+        columnspacing=1.2,
     )
 
 
 def _draw_mean(axes: Axes, mean: float) -> None:
     """Draw a mean as a dotted line, and its number in the corner."""
-    axes.axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
+    axes.axhline(mean, color=INK, linewidth=0.8, linestyle=DOTTED)
     # `g` would write large numbers with an exponent.
     number = f"{mean:.0f}" if abs(mean) >= 1000 else f"{mean:.4g}"
     axes.annotate(

@@ -64,7 +64,7 @@ def evaluation_figure(
         _draw_violations(right, controllers, styles)
         ask(
             drawn,
-            "Which controller costs least, and which violates bounds?",
+            "Which controller costs least without violating bounds?",
             f"{plain(title)}. Dots: seeds. Bars: mean and 95 % interval.",
         )
     return drawn

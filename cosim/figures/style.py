@@ -15,10 +15,13 @@ from typing import Any, Literal, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FormatStrFormatter
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, FixedLocator, FormatStrFormatter
+from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 
 from cosim.core.errors import FigureError
@@ -49,6 +52,12 @@ END_SIZE = 6.5
 TITLE_SIZE = 9.0
 DETAIL_SIZE = 7.0
 """Sizes in points of the names at lines' ends, of a figure's question, of what stands below it."""
+LINE_SPACING = 1.45
+"""Least distance of two names at lines' ends, in units of their size: less, and they touch."""
+NAME_CHARACTERS = 28
+"""Characters of a line of such a name, where there is room for several lines."""
+KEY = 7.0
+"""Width in points of the marker before a name at a line's end."""
 DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F",
@@ -83,6 +92,9 @@ _LINES: Any = [
     (0, (1, 3)),
     (0, (4, 1, 1, 1, 1, 1)),
 ]
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+# Of an axis of regrets: decades that are shown, up to which these multiples of each have a tick.
+_TICKS = ((1.3, (1, 2, 5)), (2.6, (1, 3)), (np.inf, (1,)))
 _STYLE = Path(__file__).with_name("house.mplstyle")
 
 
@@ -178,10 +190,12 @@ def save_set(
 
 
 class LineStyle(NamedTuple):
-    """Colour and line style of a case, the same in every figure of a set."""
+    """Colour, line style and marker of a case, the same in every figure of a set."""
 
     color: str
     line: Any
+    marker: str = ""
+    """Empty where no other case has the colour."""
 
 
 def palette(
@@ -190,9 +204,9 @@ def palette(
 ) -> dict[str, LineStyle]:
     """A line style for each controller or case.
 
-    Cases of one rule, `rule` and `rule(start=naive)`, share a colour and differ in their line; so
-    do `case-SCENARIO` of several scenarios. Known rules have colours of their own, the same in all
-    sets.
+    Cases of one rule, `rule` and `rule(start=naive)`, share a colour and differ in their line and
+    marker; so do `case-SCENARIO` of several scenarios. Known rules have colours of their own, the
+    same in all sets.
 
     Args:
         names: of the cases, in the order of the figures.
@@ -208,13 +222,16 @@ def palette(
             colors[rule] = _KNOWN[rule]
         elif rule not in colors:
             colors[rule] = next(other_colors)
+    # Counted by colour, not by rule: two rules may have one colour.
+    n_cases = Counter(colors[rule] for rule in rules.values())
     n_lines: Counter[str] = Counter()
     styles = {}
     for name, rule in rules.items():
         color = colors[rule]
-        # Counted by colour, not by rule: two rules may have one colour.
         number = n_lines[color] % len(_LINES)
-        styles[name] = LineStyle(color, _LINES[number])
+        # Dashes alone cannot be told apart where lines lie close.
+        marker = _MARKERS[number] if n_cases[color] > 1 else ""
+        styles[name] = LineStyle(color, _LINES[number], marker)
         n_lines[color] += 1
     return styles
 
@@ -303,6 +320,8 @@ def regret_axis(
 ) -> None:
     """Scale an axis for regrets: logarithmic above a floor, linear below, J* at zero.
 
+    The outermost ticks lie beyond the values, so that each can be read off.
+
     Args:
         axes: what is scaled.
         which: its axis.
@@ -316,20 +335,67 @@ def regret_axis(
     if finite.size:
         low = float(finite.min())
         high = float(finite.max())
+    ticks = _regret_ticks(low, high, floor)
     # A margin that is a factor; on the linear part, where J* is, a share of it.
-    first = min(1.6 * low, -0.3 * floor)
+    first = min(1.6 * low, -0.3 * floor, 1.05 * ticks[0])
     if low > floor:
-        first = low / 1.6
-    last = 1.6 * max(high, floor)
+        first = min(low / 1.6, ticks[0] / 1.05)
+    last = max(1.6 * max(high, floor), 1.05 * ticks[-1])
     # matplotlib has no setter for an axis by its letter.
     if which == "x":
         axes.set_xscale("symlog", linthresh=floor, linscale=0.5)
         axes.set_xlim(first, last)
-        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis: Axis = axes.xaxis
     else:
         axes.set_yscale("symlog", linthresh=floor, linscale=0.5)
         axes.set_ylim(first, last)
-        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis = axes.yaxis
+    axis.set_major_locator(FixedLocator(ticks))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+
+
+def _regret_ticks(low: float, high: float, floor: float) -> list[float]:
+    """Ticks of an axis of regrets, in %, increasing, the first and the last beyond the values.
+
+    Args:
+        low: least value.
+        high: largest value.
+        floor: above it the axis is logarithmic.
+    """
+    least = max(low, floor)
+    decades = np.log10(max(high, floor) / least)
+    multiples = next(multiples for most, multiples in _TICKS if decades <= most)
+    if low > floor:
+        # Beyond the largest value, so that equal ones lie between two ticks.
+        ticks = _ladder(least, 1.01 * high, multiples)
+        n_below = sum(tick <= low for tick in ticks)
+        return ticks[n_below - 1 :]
+    ticks = [0.0, *_ladder(floor, high, multiples)]
+    # A value that is a rounding error below 0 has no tick of its own.
+    if low > -0.1 * floor:
+        return ticks
+    # Finer at the end than above 0, where most of the axis is: a decade would be all but empty.
+    lowest = _ladder(floor, -low, (1, 2, 5))[-1]
+    ticks = [-lowest, *ticks]
+    for tick in _ladder(floor, -low, (1,)):
+        # One of half the outermost tick's size would be too close to it.
+        if tick < 0.4 * lowest:
+            ticks.insert(1, -tick)
+    return ticks
+
+
+def _ladder(start: float, end: float, multiples: Sequence[int]) -> list[float]:
+    """Multiples of the decades from the one of `start` to the first that is `end` or more."""
+    ticks: list[float] = []
+    exponent = int(np.floor(np.log10(start)))
+    while not ticks or ticks[-1] < end:
+        for multiple in multiples:
+            # Written, since a power of ten that is computed has a rounding error.
+            tick = float(f"{multiple}e{exponent}")
+            if not ticks or ticks[-1] < end:
+                ticks.append(tick)
+        exponent += 1
+    return ticks
 
 
 class DotRow(NamedTuple):
@@ -402,11 +468,12 @@ def _dot_row(axes: Axes, position: int, row: DotRow, color: str) -> None:
 
 
 class EndLabel(NamedTuple):
-    """A line's name as it is to be set, the ordinate at its end (data), and its colour."""
+    """A line's name as it is to be set, the ordinate at its end (data), its colour and marker."""
 
     text: str
     y: float
     color: str
+    marker: str = ""
 
 
 class CostLine(NamedTuple):
@@ -416,6 +483,8 @@ class CostLine(NamedTuple):
     samples: Array
     costs: Array
     look: Mapping[str, Any]
+    marker: str = ""
+    """Stands before the name, where it tells the line from others of its colour."""
 
 
 def cost_lines(
@@ -446,6 +515,7 @@ def cost_lines(
             text=shown_case(line.name),
             y=float(line.costs[-1]),
             color=line.look["color"],
+            marker=line.marker,
         )
         labels.append(label_of_line)
     for level in levels.values():
@@ -488,11 +558,19 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
         # A line of text, as a share of the axes' height.
         axes_pixels = axes.get_window_extent().height
         axes_points = axes_pixels * 72 / axes.figure.dpi
-        gap = 1.25 * END_SIZE / axes_points
+        gap = LINE_SPACING * END_SIZE / axes_points
+        texts = [name.text for name in names]
+        # Long names would leave a narrow panel no room.
+        wrapped = [textwrap.fill(text, NAME_CHARACTERS) for text in texts]
+        most_lines = 1 + max(text.count("\n") for text in wrapped)
+        if most_lines * gap * len(names) <= 1.0:
+            texts = wrapped
+            gap *= most_lines
         positions = spread(ends[highest_first], gap)
         for position, index in zip(positions, highest_first, strict=True):
+            name = names[index]._replace(text=texts[index])
             end = float(ends[index])
-            _label_end(axes, names[index], end, float(position))
+            _label_end(drawn, axes, name, end, float(position))
 
 
 def _height(axes: Axes, y: float) -> float:
@@ -505,7 +583,13 @@ def _height(axes: Axes, y: float) -> float:
     return float((here - bottom) / (top - bottom))
 
 
-def _label_end(axes: Axes, name: EndLabel, end: float, position: float) -> None:
+def _label_end(
+    drawn: Figure,
+    axes: Axes,
+    name: EndLabel,
+    end: float,
+    position: float,
+) -> None:
     """Write a name at a position, with a line to its line's end; both are shares of the height."""
     arrow: Any = {
         "arrowstyle": "-",
@@ -515,12 +599,27 @@ def _label_end(axes: Axes, name: EndLabel, end: float, position: float) -> None:
         "shrinkA": 0.5,
         "relpos": (0.0, 0.5),
     }
+    # The marker of the line stands before its name, as in a legend.
+    indent = KEY if name.marker else 0.0
+    scale = drawn.dpi_scale_trans
+    beside: Any = axes.transAxes + ScaledTranslation(indent / 72, 0.0, scale)
+    if name.marker:
+        key = Line2D(
+            [1.035],
+            [position],
+            marker=name.marker,
+            markersize=3.5,
+            color=name.color,
+            clip_on=False,
+            transform=axes.transAxes + ScaledTranslation(0.4 * KEY / 72, 0.0, scale),
+        )
+        axes.add_artist(key)
     axes.annotate(
         name.text,
         xy=(1.0, end),
         xytext=(1.035, position),
         xycoords="axes fraction",
-        textcoords="axes fraction",
+        textcoords=beside,
         fontsize=END_SIZE,
         color=name.color,
         va="center",

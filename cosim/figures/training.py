@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import cycle, product
@@ -41,7 +42,9 @@ POINTS = 30
 BLOCKS = 4
 """Blocks of θ that are drawn, at most: those that moved most."""
 PANEL_COLUMNS = 4
-"""Panels beside each other in the paper's figure."""
+"""Panels beside each other in the paper's figure; half of them in a narrow one."""
+PANEL_TITLE_SIZE = 8.0
+"""Size in points of a panel's title."""
 Panel = Callable[[Axes], Sequence[EndLabel]]
 """Draws a panel on its axes and returns the names at its lines' ends."""
 # A marker at the edge of the axes is drawn whole.
@@ -49,6 +52,13 @@ _LINE: Any = {
     "markersize": 3,
     "linewidth": 1.2,
     "clip_on": False,
+}
+# Of what is known where the policy was judged, and nowhere between: a line would tell of progress.
+_JUDGED: Any = {
+    "marker": "o",
+    "color": LEARNED_COLOR,
+    "linestyle": (0, (1, 2)),
+    "linewidth": 0.8,
 }
 # Of the entries of a block, in turn: solid in every colour, then dashed.
 _ENTRY_LOOKS: list[dict[str, Any]] = []
@@ -90,13 +100,20 @@ def training_figure(
         labels = []
         for axes, (name, draw) in zip(grid.flat, panels.items(), strict=True):
             labels.append((axes, draw(axes)))
-            axes.set_title(name, loc="left", fontsize=8.0)
+            _set_title(axes, name, width / columns)
             samples_axis(axes, end)
         for axes in grid[-1]:
             axes.set_xlabel("training samples")
         ask(drawn, "Did the controller become better while it learned?", plain(title))
         label_ends(drawn, labels)
     return drawn
+
+
+def _set_title(axes: Axes, title: str, width: float) -> None:
+    """Write a title above axes, from their left edge, in lines that fit a width in inches."""
+    # A letter is about half as wide as it is high; a fifth of the width is beside the axes.
+    characters = int(0.8 * 72 * width / (0.52 * PANEL_TITLE_SIZE))
+    axes.set_title(textwrap.fill(title, characters), loc="left", fontsize=PANEL_TITLE_SIZE)
 
 
 def _training_panels(
@@ -126,8 +143,8 @@ def _training_panels(
             _draw_course,
             samples=samples,
             values=100 * share,
-            color=LEARNED_COLOR,
             least=1.0,
+            **_JUDGED,
         )
     samples, error = _known(log, "td_error")
     # A single error makes no curve.
@@ -136,8 +153,8 @@ def _training_panels(
             _draw_course,
             samples=samples,
             values=error,
-            color=INK,
             least=1e-12,
+            color=INK,
         )
     moved = _most_moved(theta)
     if moved:
@@ -191,11 +208,14 @@ def _draw_cost(
     lines = []
     samples, cost = _known(log, "J")
     if cost.size:
-        look = _LINE | {"marker": "", "color": INK}
-        lines.append(CostLine("training", samples, shown(cost), look))
+        # Each is a mean over the samples since the row before, and a line of that length.
+        begin = log["samples"][log["samples"] < samples[0]][-1:]
+        look = _LINE | {"color": INK, "drawstyle": "steps-pre"}
+        costs = shown(np.append(cost[: len(begin)], cost))
+        lines.append(CostLine("training", np.append(begin, samples), costs, look))
     samples, cost = _known(log, "greedy_J")
     if cost.size:
-        look = _LINE | {"marker": "o", "color": LEARNED_COLOR}
+        look = _LINE | _JUDGED
         lines.append(CostLine("greedy", samples, shown(cost), look))
     levels = {name: float(shown(level)) for name, level in baselines.items()}
     return cost_lines(axes, lines, levels, relative=best is not None)
@@ -205,12 +225,11 @@ def _draw_course(
     axes: Axes,
     samples: Array,
     values: Array,
-    color: str,
     least: float,
+    **look: Any,
 ) -> Sequence[EndLabel]:
     """A line from 0 to `least` or more, logarithmic where it spans decades; it has no name."""
-    marker = "." if len(values) < POINTS else ""
-    axes.plot(samples, values, marker=marker, color=color, **_LINE)
+    axes.plot(samples, values, **_LINE | {"marker": _marker(values)} | look)
     low = float(values.min())
     top = max(float(values.max()), least)
     # 20k in place of 20000: a panel is narrow.
@@ -224,13 +243,18 @@ def _draw_course(
     return ()
 
 
+def _marker(values: Array) -> str:
+    """Marker of the points of a line, none where they are many."""
+    return "." if len(values) < POINTS else ""
+
+
 def _draw_change(axes: Axes, samples: Array, moved: Mapping[str, Array]) -> list[EndLabel]:
     """Norm of the increments of blocks of θ, each (K,)."""
     labels = []
     top = 0.0
     # No more blocks are drawn than there are colours.
     for color, (name, norm) in zip(ENTRIES, moved.items(), strict=False):
-        axes.plot(samples, norm, color=color, linewidth=1.2)
+        axes.plot(samples, norm, color=color, **_LINE | {"marker": _marker(norm)})
         end = float(norm[-1])
         labels.append(EndLabel(symbol(name), end, color))
         top = max(top, float(norm.max()))
@@ -246,6 +270,7 @@ def parameters_figure(
     samples: Array,
     increments: Mapping[str, Array],
     td_error: Array,
+    width: float = WIDTH,
 ) -> Figure:
     """The paper's figure of a training: increments of θ by block, and the TD error.
 
@@ -255,35 +280,37 @@ def parameters_figure(
         samples: of the training, (K,).
         increments: θ − θ₀ of each block by its name, (K, entries).
         td_error: root mean square over the preceding `TD_WINDOW` samples, (K,).
+        width: in inches; a narrow figure has fewer panels beside each other.
     """
     # A rule learns some blocks of θ only.
     moving = {name: values for name, values in increments.items() if np.any(values)}
-    rows = -(-len(moving) // PANEL_COLUMNS)
+    columns = PANEL_COLUMNS if width >= NARROW else PANEL_COLUMNS // 2
+    rows = -(-len(moving) // columns)
     # The TD error, across the page, is a little higher than the panels of θ.
     heights = [1.0] * rows
     heights.append(1.2)
-    with figure(1.3 * rows + 2.2) as drawn:
-        grid = drawn.add_gridspec(rows + 1, PANEL_COLUMNS, height_ratios=heights)
+    with figure(1.3 * rows + 2.2, width) as drawn:
+        grid = drawn.add_gridspec(rows + 1, columns, height_ratios=heights)
         first: Axes | None = None
         most_entries = 0
         for i, (name, values) in enumerate(moving.items()):
-            row, column = divmod(i, PANEL_COLUMNS)
+            row, column = divmod(i, columns)
             axes = drawn.add_subplot(grid[row, column], sharex=first)
             first = first or axes
             _draw_increments(axes, samples, name, values)
             # Samples stand below the lowest panel of each column.
-            is_lowest = i + PANEL_COLUMNS >= len(moving)
+            is_lowest = i + columns >= len(moving)
             axes.tick_params(labelbottom=is_lowest)
             most_entries = max(most_entries, values.shape[1])
         axes = drawn.add_subplot(grid[rows, :], sharex=first)
         axes.plot(samples, td_error, color=INK, linewidth=1.0)
         samples_axis(axes, float(samples[-1]), "samples")
         title = f"TD error in the stage cost's unit, r.m.s. of the preceding {TD_WINDOW} samples"
-        axes.set_title(title, loc="left", fontsize=8.0)
+        _set_title(axes, title, width)
         # A θ that never moved has no entries to name.
         if moving:
-            _draw_entries_legend(drawn, most_entries)
-        ask(drawn, "How far has each block of θ moved, and does the TD error fall?")
+            _draw_entries_legend(drawn, most_entries, legend_columns=3 * columns)
+        ask(drawn, "How do θ and the TD error change while the rule learns?")
     return drawn
 
 
@@ -292,12 +319,12 @@ def _draw_increments(axes: Axes, samples: Array, name: str, values: Array) -> No
     # Of a block with more entries than looks the first looks come again.
     for entry, look in zip(values.T, cycle(_ENTRY_LOOKS), strict=False):
         axes.plot(samples, entry, linewidth=0.8, **look)
-    axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
+    axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=PANEL_TITLE_SIZE)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
 
 
-def _draw_entries_legend(drawn: Figure, most_entries: int) -> None:
+def _draw_entries_legend(drawn: Figure, most_entries: int, legend_columns: int) -> None:
     """Number the looks of a block's entries, as many as the largest block has."""
     handles = []
     for number, look in enumerate(_ENTRY_LOOKS[:most_entries], start=1):
@@ -305,6 +332,6 @@ def _draw_entries_legend(drawn: Figure, most_entries: int) -> None:
     drawn.legend(
         handles=handles,
         loc="outside lower center",
-        ncols=12,
+        ncols=legend_columns,
         title="entry of its block, in the block's own unit",
     )

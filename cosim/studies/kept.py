@@ -157,7 +157,7 @@ def _training_figures(plan: StudyPlan, out: Path) -> Iterator[tuple[str, Figure]
         error_of_row = log["td_error"].to_numpy(float)
         updates = log["updates"].to_numpy(float)
         td_error = td_error_mean(samples, error_of_row, updates)
-        drawn = parameters_figure(samples, blocks, td_error)
+        drawn = parameters_figure(samples, blocks, td_error, width=style.SCREEN)
         yield f"parameters-{path.stem}", drawn
 
 

@@ -26,6 +26,8 @@ BANDED = 6
 """Largest number of curves with bands in a panel: more cannot be told apart."""
 MOST_LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
+MARKER_DISTANCE = 0.2
+"""Distance of two markers of a curve, as a share of its panel's diagonal."""
 PAGE_CHARACTERS = 132
 """Characters of a legend across the page."""
 TIME_MARKS = {"hour": 1, "shift": 8, "day": 24, "week": 168}
@@ -111,14 +113,16 @@ def regret_figure(
         # An arrow stands where an interval leaves the axes.
         left, _ = axes.get_xlim()
         cut = [position for position, row in enumerate(rows) if row.low < left]
-        axes.plot(
-            np.full(len(cut), left),
-            cut,
-            "<",
-            color=style.INK,
-            markersize=3,
-            clip_on=False,
-        )
+        # Of an empty line, not clipped, the layout believes that it lies at the page's foot.
+        if cut:
+            axes.plot(
+                np.full(len(cut), left),
+                cut,
+                "<",
+                color=style.INK,
+                markersize=3,
+                clip_on=False,
+            )
         axes.set_xlabel("regret %: cost above the least possible")
         style.ask(
             drawn,
@@ -339,7 +343,7 @@ def curves_figure(
         bands = "; bands: their quartiles" if most_curves <= BANDED else ""
         style.ask(
             drawn,
-            "How many samples does each rule need, and what does learning cost?",
+            "How many samples does each rule need?",
             f"Lines: medians over the runs{bands}.",
         )
         style.label_ends(drawn, labels)
@@ -401,10 +405,14 @@ def _median_lines(
         look: dict[str, Any] = {
             "color": color,
             "linestyle": dashes[name].line,
+            "marker": dashes[name].marker,
+            "markersize": 3.5,
+            # As a share of the panel: curves have some or hundreds of points.
+            "markevery": MARKER_DISTANCE,
             "linewidth": 1.3,
             "label": shown_case(name).replace(start_setting, ""),
         }
-        lines.append(style.CostLine(name, samples, median, look))
+        lines.append(style.CostLine(name, samples, median, look, dashes[name].marker))
         if len(values) > 1 and len(curves) <= BANDED:
             axes.fill_between(
                 samples,
@@ -465,11 +473,11 @@ def operation_figure(
     """Greedy regret and regret of the whole run against the plant's samples, on log axes.
 
     Lines are medians over the training seeds, bands from the best to the worst. Vertical lines
-    stand at an hour, a shift, a day, a week.
+    stand at an hour, a shift, a day, a week, and where the plant changes.
 
     Args:
         result: the regrets of all runs.
-        layout: the plant's sampling time, and the cases that are drawn.
+        layout: the plant's sampling time and changes, and the cases that are drawn.
         styles: line style of each case.
         baselines: cases with a dashed line and no band.
         width: in inches; panels of a narrow figure stand below each other.
@@ -491,7 +499,9 @@ def operation_figure(
         panels = drawn.subplots(*shape, sharey=True)
         ends = []
         for axes, (column, title) in zip(panels, titles.items(), strict=True):
-            labels = _draw_regret_courses(axes, runs, column, styles, baselines)
+            # Of θ on the plant as it is then: it jumps with the plant. The whole run's does not.
+            breaks = layout.changes if column == "regret" else ()
+            labels = _draw_regret_courses(axes, runs, column, styles, baselines, breaks)
             axes.set_xscale("log")
             axes.set_xlim(first, last)
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -499,16 +509,19 @@ def operation_figure(
             axes.xaxis.set_minor_formatter(NullFormatter())
             style.regret_axis(axes, "y", all_regrets)
             _mark_times(axes, layout.sampling_time, first, last)
-            # From the left edge: a narrow panel is narrower than its title.
-            axes.set_title(title, loc="left", pad=12)
+            _mark_changes(axes, layout.changes, first, last)
+            # From the left edge: a narrow panel is narrower than its title. The changes have a
+            # line of their own, above the times.
+            axes.set_title(title, loc="left", pad=20 if layout.changes else 12)
             axes.set_xlabel("samples of the plant")
             # Panels beside each other share their ordinate: names stand right of the last one.
             if is_narrow or axes is panels[-1]:
                 ends.append((axes, labels))
         style.ask(
             drawn,
-            "How good is each controller after so many samples, and what have they cost?",
-            "Lines: medians over the training seeds; bands: the best to the worst run.",
+            "How good is each controller after so many samples?",
+            "Lines: medians over the training seeds, measured at the markers; "
+            "bands: the best to the worst run.",
         )
         style.label_ends(drawn, ends)
     return drawn
@@ -520,6 +533,7 @@ def _draw_regret_courses(
     column: str,
     styles: Mapping[str, LineStyle],
     baselines: Sequence[str],
+    breaks: Iterable[int] = (),
 ) -> list[EndLabel]:
     """Draw the regret of each case over the samples; return the cases' names for `label_ends`.
 
@@ -529,6 +543,7 @@ def _draw_regret_courses(
         column: of the regret.
         styles: of which the colours are taken.
         baselines: cases with a dashed line and no band.
+        breaks: samples before which the lines are interrupted.
     """
     # Dashes are of the cases that are drawn, colours the same in all figures of the study.
     dashes = palette(list(runs.case.unique()))
@@ -538,34 +553,36 @@ def _draw_regret_courses(
         color = styles[case].color
         regrets_at_marks = rows.groupby("samples")[column]
         spread = 100 * regrets_at_marks.agg(["min", "median", "max"])
-        samples = spread.index
-        median = spread["median"]
-        if case in baselines:
-            axes.plot(
-                samples,
-                median,
-                color=color,
-                linestyle=DASHED,
-                linewidth=0.9,
-            )
-        else:
-            axes.plot(
-                samples,
-                median,
-                color=color,
-                linestyle=dashes[case].line,
-                linewidth=1.5,
-            )
+        end = float(spread["median"].iloc[-1])
+        # A rule's variants have markers of their own, which tell them apart.
+        marker = dashes[case].marker
+        labels.append(EndLabel(shown_case(case), end, color, marker))
+        for sample in breaks:
+            # No line leads from a mark before to one after it.
+            spread.loc[sample - 0.5] = np.nan
+        spread = spread.sort_index()
+        is_baseline = case in baselines
+        axes.plot(
+            spread.index,
+            spread["median"],
+            color=color,
+            linestyle=DASHED if is_baseline else dashes[case].line,
+            linewidth=0.9 if is_baseline else 1.5,
+            # Between the marks nothing was measured.
+            marker=marker or ".",
+            markersize=3.5,
+            # The first and the last mark lie at the edges of the axes.
+            clip_on=False,
+        )
+        if not is_baseline:
             axes.fill_between(
-                samples,
+                spread.index,
                 spread["min"],
                 spread["max"],
                 color=color,
                 alpha=0.12,
                 linewidth=0,
             )
-        end = float(median.iloc[-1])
-        labels.append(EndLabel(shown_case(case), end, color))
     return labels
 
 
@@ -582,24 +599,62 @@ def _mark_times(axes: Axes, sampling_time: float, first: float, last: float) -> 
         samples = hours * 3600.0 / sampling_time
         if not first <= samples <= last:
             continue
-        # Near an edge the name is set inwards.
-        position = np.log(samples / first) / np.log(last / first)
-        side = "center"
-        if position < 0.06:
-            side = "left"
-        elif position > 0.94:
-            side = "right"
-        axes.axvline(samples, color=style.REFERENCE, linewidth=0.7, linestyle=(0, (1, 2)))
-        axes.annotate(
-            name,
-            (samples, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 2),
-            textcoords="offset points",
-            ha=side,
-            fontsize=6.5,
-            color=style.REFERENCE,
-        )
+        dotted = (0, (1, 2))
+        axes.axvline(samples, color=style.REFERENCE, linewidth=0.7, linestyle=dotted)
+        _name_line(axes, name, samples, height=2.0, color=style.REFERENCE)
+
+
+def _mark_changes(
+    axes: Axes,
+    changes: Mapping[int, Mapping[str, float]],
+    first: float,
+    last: float,
+) -> None:
+    """Draw a line where the plant changes, named by what its parameters then are.
+
+    Args:
+        axes: where they are drawn.
+        changes: new values of the plant's parameters, by the sample.
+        first: least sample of the axis.
+        last: largest sample of the axis.
+    """
+    for sample, parameters in changes.items():
+        if not first <= sample <= last:
+            continue
+        values = [f"{style.label(name, '')} = {value:g}" for name, value in parameters.items()]
+        axes.axvline(sample, color=style.BOUND, linewidth=0.9)
+        # Above the names of the times, which may stand close by.
+        _name_line(axes, ", ".join(values), sample, height=10.5, color=style.BOUND)
+
+
+def _name_line(axes: Axes, name: str, sample: float, height: float, color: str) -> None:
+    """Write the name of a vertical line above the axes, a log axis of samples.
+
+    Args:
+        axes: where it is written.
+        name: what is written.
+        sample: where the line stands.
+        height: above the axes, in points.
+        color: of the letters.
+    """
+    first, last = axes.get_xlim()
+    # Near an edge the name is set inwards.
+    position = np.log(sample / first) / np.log(last / first)
+    side = "center"
+    if position < 0.06:
+        side = "left"
+    elif position > 0.94:
+        side = "right"
+    axes.annotate(
+        name,
+        (sample, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(0, height),
+        textcoords="offset points",
+        ha=side,
+        fontsize=6.5,
+        color=color,
+    )
 
 
 STUDY_FIGURES: dict[str, Callable[[StudyMeasurements, str, float], Figure | None]] = {

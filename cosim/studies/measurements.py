@@ -344,10 +344,15 @@ class StudyMeasurements:
     def operation_layout(self, scenario: str) -> OperationLayout:
         """Layout of tables and figure of a scenario in operation."""
         about = self.about["operation"][scenario]
+        changes = {}
+        # Only of a plant that changes: most do not.
+        for change in about.get("changes", []):
+            changes[int(change["sample"])] = change["parameters"]
         return OperationLayout(
             sampling_time=about["sampling_time"],
             columns=about["columns"],
             drawn=about["drawn"],
+            changes=changes,
         )
 
     def processor_seconds(self, scenario: str) -> dict[str, float]:

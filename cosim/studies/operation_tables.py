@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -38,11 +38,13 @@ class OperationLayout:
         sampling_time: of the plant, in s.
         columns: marks that tables show.
         drawn: cases that the figure shows; empty: all.
+        changes: what changes in the plant, by the sample at which it does.
     """
 
     sampling_time: float
     columns: Sequence[int]
     drawn: Sequence[str] = ()
+    changes: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def times(self) -> list[str]:

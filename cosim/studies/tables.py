@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
@@ -11,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from cosim.core.scenario import Scenario
 from cosim.core.training_options import LOG
 from cosim.evaluation import EVALUATION, NAIVE, TIMING
 from cosim.studies.definition import Case, Study
@@ -232,8 +234,22 @@ def _about_operation(study: Study) -> dict[str, dict[str, Any]]:
             # Without columns of its own a table shows every mark.
             "columns": columns or marks,
             "drawn": table.drawn,
+            "changes": _plant_changes(scenario),
         }
     return about
+
+
+def _plant_changes(scenario: Scenario) -> list[dict[str, Any]]:
+    """When a scenario's plant changes, and to what: entries with `sample` and `parameters`."""
+    changes = []
+    for change in scenario.plant.changes or ():
+        entry = {
+            # The first one at or after the change; their ratio has a rounding error.
+            "sample": math.ceil(round(change.time / scenario.sampling_time, 6)),
+            "parameters": dict(change.parameters),
+        }
+        changes.append(entry)
+    return changes
 
 
 def _commit() -> str:

@@ -1,5 +1,7 @@
 """Figures of a study from made-up numbers: what is drawn is what was given."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,9 +9,15 @@ import pytest
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures.states import density_figure
 from cosim.figures.style import lighten, palette, shown_case
+from cosim.studies.definition import Study
 from cosim.studies.figures import LearningCurve, curves_figure, learning_curve
 from cosim.studies.kept import increments
+from cosim.studies.plan import plan
+from cosim.studies.results import StudyResults
+from cosim.studies.tables import document
 from tests.helpers.loop import Proportional
+
+RESULTS = Path(__file__).parents[3] / "results"
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +86,19 @@ def test_many_curves_have_a_panel_for_each_start():
     plain = {name.replace("start", "mine"): one for name in cases}
     first, _ = curves_figure(plain, {}, palette([*plain]), relative=True).axes
     assert len(first.texts) == len(cases)
+
+
+def test_a_stored_study_says_when_its_plant_changes():
+    """As its file does, from which the figure of operation marks it."""
+    stored = StudyResults.load(RESULTS / "operation-plants")
+    said = document(plan(Study.load(RESULTS / "operation-plants.toml")))["operation"]
+    assert stored.about["operation"] == said
+    layout = stored.operation_layout("jump")
+    assert layout.changes == {11_700: {"UA2": 5.2}, 26_400: {"UA2": 6.84}}
+    assert stored.operation_layout("drifting").changes == {}
+
+
+def test_variants_of_a_rule_have_markers_and_a_lone_rule_has_none():
+    styles = palette(["q(start=naive)", "q(start=tuned)", "dyna"])
+    assert styles["q(start=naive)"].marker != styles["q(start=tuned)"].marker
+    assert styles["dyna"].marker == ""

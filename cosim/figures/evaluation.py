@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -90,7 +90,7 @@ def _draw_costs(
     values = dot_rows(axes, rows, styles)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
-        regret_axis(axes, "x", np.append(values, 0.0), SEED_FLOOR)
+        regret_axis(axes, "x", _reached(rows), SEED_FLOOR)
         axes.set_xlabel("regret %: cost above the least possible")
         return
     least = float(values.min())
@@ -99,6 +99,15 @@ def _draw_costs(
     if least > 0 and most > DECADE * least:
         axes.set_xscale("log")
     axes.set_xlabel("J per sample: economic cost and penalty")
+
+
+def _reached(rows: Sequence[DotRow]) -> Array:
+    """What an axis from 0 on must show of rows: their values and the intervals' upper ends."""
+    reached = [np.zeros(1)]
+    for row in rows:
+        # Lower ends may be below 0, and the axis need not reach them.
+        reached += [row.values, np.array([row.high])]
+    return np.concatenate(reached)
 
 
 def _dots(name: str, values: Array, estimate: Estimate, scale: float = 1.0) -> DotRow:
@@ -124,6 +133,6 @@ def _draw_violations(
     for name, costs in controllers.items():
         shares = costs.violating_share.to_numpy()
         rows.append(_dots(name, 100 * shares, mean_of(shares), scale=100.0))
-    values = dot_rows(axes, rows, styles)
-    regret_axis(axes, "x", np.append(values, 0.0), SHARE_FLOOR)
+    dot_rows(axes, rows, styles)
+    regret_axis(axes, "x", _reached(rows), SHARE_FLOOR)
     axes.set_xlabel("samples that violate a bound, %")

@@ -200,3 +200,13 @@ def test_a_change_of_the_plant_is_marked_and_parts_the_lines():
     assert np.isnan(fixed.get_ydata()[before])
     for line in whole.lines:
         assert np.isfinite(np.asarray(line.get_ydata(), dtype=float)).all()
+
+
+def test_an_evaluations_axis_reaches_the_upper_ends_of_its_intervals():
+    """Of two seeds the interval is many times as wide as they lie apart."""
+    J = np.array([6510.0, 6530.0])
+    costs = {"a": pd.DataFrame({"J": J, "violating_share": np.array([0.0, 0.1])})}
+    drawn = evaluation_figure(costs, title="t", optimal=np.array([6500.0, 6500.0]))
+    for axes, middle, deviation in zip(drawn.axes, (0.3077, 5.0), (0.2176, 7.071), strict=True):
+        upper = middle + 12.7062 * deviation / np.sqrt(2.0)
+        assert axes.get_xticks()[-1] >= upper

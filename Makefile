@@ -8,7 +8,7 @@ PYTEST := $(BIN)/python -m pytest -n auto
 .PHONY: demo test check docs pictures campaign platforms sanitised clean
 
 demo: $(VENV)/installed
-	$(BIN)/cosim demo --out demo
+	$(BIN)/cosim demo --out demo --overwrite
 
 test: $(VENV)/installed
 	$(PYTEST)
@@ -23,7 +23,7 @@ check: $(VENV)/installed-dev
 	$(MAKE) docs
 	$(PYTEST) -m slow
 	$(BIN)/cosim results check
-	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo
+	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo --overwrite
 
 # The figures of the stored studies, which the site shows; drawn anew where a table is newer.
 build/figures: $(wildcard results/*.toml results/*/*.csv cosim/figures/* cosim/studies/*.py) | $(VENV)/installed-dev

@@ -80,7 +80,10 @@ def measure_picture(folder):
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             command = [sys.executable, "-m", "cosim", "simulate", "--json", "-n", "999", *words]
             subprocess.run(
-                [*command, "--out", "run"], cwd=folder, stdout=subprocess.DEVNULL, check=True
+                [*command, "--out", "run", "--overwrite"],
+                cwd=folder,
+                stdout=subprocess.DEVNULL,
+                check=True,
             )
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             spent.append(after.ru_utime - before.ru_utime)

@@ -90,18 +90,18 @@ JOBS = (
     ),
     Job(
         "evaluation",
-        "evaluate --seeds 8 --steps 2000 --jobs 2 --out out",
+        "evaluate --seeds 8 --steps 2000 --jobs 2 --out out --overwrite",
         ("out/evaluation.csv",),
     ),
     Job("study", "study run study.toml --jobs 2 --out out", ("out/summary.csv",), _study),
     Job(
         "recording",
-        "simulate --steps 20000 --record --out out",
+        "simulate --steps 20000 --record --out out --overwrite",
         ("out/trajectory.csv", "out/scenario.toml"),
     ),
     Job(
         "demo",
-        "demo --samples 1000 --steps 20 --out out",
+        "demo --samples 1000 --steps 20 --out out --overwrite",
         ("out/evaluation.csv", "out/learning.csv", "out/parameters.toml"),
     ),
     Job("update", "results update --results out --jobs 2", ("out/runs/summary.csv",), _stored),

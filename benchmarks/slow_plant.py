@@ -98,7 +98,8 @@ def measure_jobs(folder, steps):
     for jobs in ("1", "2"):
         for length in (1, steps):
             words = ["evaluate", "-s", f"{NAME}.toml", "-c", "naive", "--seeds", "8"]
-            words += ["--steps", str(length), "--jobs", jobs, "--out", "evaluated"]
+            words += ["--steps", str(length), "--jobs", jobs]
+            words += ["--out", "evaluated", "--overwrite"]
             seconds, counted, _ = command(*words, folder=folder)
             spent[jobs, length] = seconds
             print(f"evaluate, 8 seeds × {length}, {jobs} jobs: {seconds:.1f} s, {counted} steps")

@@ -25,6 +25,7 @@ from cosim.core.errors import EvaluationError
 from cosim.core.files import holding, staged
 from cosim.core.protocols import Array, Decision
 from cosim.core.result import Result, text_table
+from cosim.core.run_files import EVALUATION_FILES
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import indicators, measure, reporting, simulate
 from cosim.core.training_options import PARAMETERS
@@ -41,15 +42,6 @@ OPTIMAL = "optimal"
 EVALUATION = "evaluation.csv"
 TIMING = "timing.csv"
 PICTURE = "evaluation.png"
-EVALUATION_FILES = (
-    EVALUATION,
-    TIMING,
-    PICTURE,
-    "scenario.toml",
-    "summary.json",
-    "judged.csv",
-)
-"""Files of an evaluation; all in a folder belong to one."""
 MOST_SEEDS = 1_000_000
 WORKER_START = 2.0
 """Seconds of work below which starting workers takes longer than doing it."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from cosim.core.errors import CosimWarning, EvaluationError, warn
 from cosim.core.files import temporary_folder
-from cosim.core.modules import OURS, import_folders, import_from
+from cosim.core.modules import OURS, import_folders, import_from, users_place
 from cosim.core.processes import Terminated, follow_parent, without_interrupts
 from cosim.core.scenario import Scenario, is_file
 from cosim.core.validation import whole_number
@@ -215,7 +215,11 @@ def _failure(error: BaseException) -> Failure:
     # Classes of others need not be there where the error is raised again.
     if isinstance(error, Exception) and package in OURS:
         kind = type(error)
-    return Failure(f"{name}: {text}", traceback.format_exc(), kind)
+    place = users_place(error)
+    message = f"{name}: {text}"
+    if place:
+        message = f"{place}: {message}"
+    return Failure(message, traceback.format_exc(), kind)
 
 
 def done(

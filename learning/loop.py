@@ -19,7 +19,7 @@ from cosim.core.simulation import ClosedLoop
 from cosim.plant import FmuPlant
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import State, generator_state, part_of, prefixed, set_generator_state
-from learning.errors import PrivilegeError
+from learning.errors import ConfigurationError, PrivilegeError
 from learning.exploration import Strategy
 from learning.gaussian_penalty import normal_penalties
 from learning.retreat import Retreat
@@ -201,6 +201,7 @@ class TrainingLoop:
         Raises:
             DivergenceError: by the rule.
             PrivilegeError: the rule asks more of the plant than it `requires`.
+            ConfigurationError: the rule's `observe` returns what is no update.
         """
         # Asked before the sample: the last one that may teach still does.
         has_ended = self.has_ended
@@ -214,6 +215,9 @@ class TrainingLoop:
                 self.algorithm.watch(transition)
         elif transition is not None:
             update = self.algorithm.observe(transition)
+            if update is not None and not isinstance(update, Update):
+                got = type(update).__name__
+                raise ConfigurationError(f"observe must return None or Update, got {got}")
         elif hasattr(self.algorithm, "failed"):
             update = self.algorithm.failed(cost)
         if update is not None and update.lost and self._retreat is not None:

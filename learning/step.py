@@ -363,7 +363,13 @@ class ConstrainedStep:
 
         Returns:
             What the log says of the step.
+
+        Raises:
+            ValueError: θ has another shape.
         """
+        expected = self._controller.theta.shape
+        if np.shape(theta) != expected:
+            raise ValueError(f"θ has shape {np.shape(theta)}, needs {expected}")
         change = theta - self._controller.theta
         step = change / self.scale
         # In the metric I the minimiser is the step itself.

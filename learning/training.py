@@ -25,6 +25,7 @@ from cosim.core.errors import CapabilityError
 from cosim.core.files import check_target, staged, write_atomically
 from cosim.core.protocols import Array
 from cosim.core.result import Result
+from cosim.core.run_files import TRAINING_FILES
 from cosim.core.scenario import Scenario
 from cosim.core.simulation import functions_of, reporting, simulate
 from cosim.core.statistics import Estimate, shown
@@ -54,11 +55,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FIGURE = "learning.png"
-TRAINING_FILES = (
-    CHECKPOINT, LOG, PARAMETERS, FIGURE, "learning.gif", "summary.json", "scenario.toml",
-    "training.rrd",
-)  # fmt: skip
-"""Files of a training; all in a folder belong to one run."""
 REMARKS = {
     "J": "J",
     "greedy_J": "greedy J",

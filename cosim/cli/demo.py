@@ -42,6 +42,7 @@ def demo(
     seed: cli.SeedOption = 0,
     pairs: PairsOption = False,
     out: cli.OutOption = Path("cosim-demo"),
+    overwrite: cli.OverwriteOption = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Let two rules learn on a plant unlike their model, and compare what they learned.
@@ -60,13 +61,14 @@ def demo(
     """
     with cli.output(json) as out_:
         from cosim.core.files import staged, temporary_folder
+        from cosim.core.run_files import RUN_FILES
         from cosim.core.training_options import HELD_OUT
         from cosim.core.trajectory import RunSignals
         from cosim.figures.style import save
         from cosim.figures.trajectory import overlay_figure
 
         scenario = cosim.Scenario.load(SCENARIO)
-        folder = cli.open_folder(out)
+        folder = cli.open_folder(out, overwrite)
         out_.note(scenario.description)
         # Noise that no training met.
         first = 2 * HELD_OUT + seed
@@ -91,7 +93,7 @@ def demo(
                 signals[name] = RunSignals(name, run.signals, run.status, scenario.limits)
         summary: dict[str, Any] = evaluation.summary()
         summary["training"] = {name: training.summary() for name, training in trained.items()}
-        with staged(folder) as stage:
+        with staged(folder, RUN_FILES) as stage:
             evaluation.write_files(stage)
             save(overlay_figure(runs), stage / "before-after.png")
             for name, training in trained.items():

@@ -14,6 +14,7 @@ import cosim
 from cosim.cli import output as cli
 from cosim.core.errors import CosimError
 from cosim.core.files import staged, write_atomically
+from cosim.core.run_files import RUN_FILES
 
 PairsOption = Annotated[
     bool, typer.Option("--pairs", help="Print the paired difference of each two controllers too.")
@@ -32,6 +33,7 @@ def evaluate(
     jobs: cli.JobsOption = None,
     scheduler: cli.SchedulerOption = None,
     plot: Annotated[bool, typer.Option("--plot")] = False,
+    overwrite: cli.OverwriteOption = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Compare controllers on the same disturbances, seed by seed.
@@ -50,13 +52,14 @@ def evaluate(
         plot: Draw evaluation.png too.
     """
     with cli.output(json) as out_:
-        from cosim.evaluation import EVALUATION_FILES, PICTURE, named_controllers
+        from cosim.evaluation import PICTURE, named_controllers
 
         task = cosim.Scenario.load(scenario)
         if trajectories is not None:
             if plot:
                 raise CosimError("--plot draws controllers, not the runs of --trajectories")
-            _evaluate_trajectories(task, trajectories, cli.open_folder(out), out_)
+            folder = cli.open_folder(out, overwrite)
+            _evaluate_trajectories(task, trajectories, folder, out_)
             return
         names = []
         for text in controllers:
@@ -72,7 +75,7 @@ def evaluate(
         if first_seed > 0:
             words += ["--first-seed", str(first_seed)]
         words += ["--steps", str(steps)]
-        folder = cli.open_folder(out)
+        folder = cli.open_folder(out, overwrite)
         out_.announce(task.plant.fmu)
         evaluation = cosim.evaluate(
             task,
@@ -86,7 +89,7 @@ def evaluate(
         )
         summary = evaluation.summary()
         # All files or none: a table and a summary in a folder are of one evaluation.
-        with staged(folder, EVALUATION_FILES) as stage:
+        with staged(folder, RUN_FILES) as stage:
             evaluation.write_tables(stage)
             if plot:
                 evaluation.plot(stage / PICTURE)
@@ -104,7 +107,7 @@ def _evaluate_trajectories(
 ) -> None:
     """Recompute the costs of loops that another tool ran; print and write them."""
     from cosim.core.statistics import mean, regret, shown
-    from cosim.evaluation import EVALUATION_FILES, judge
+    from cosim.evaluation import judge
 
     table = judge(scenario, trajectories)
     cost = table["J"].to_numpy()
@@ -128,8 +131,8 @@ def _evaluate_trajectories(
         "regret": regret(cost, optimum)._asdict(),
         "violating_share": float(violating_share),
     }
-    # The files of another evaluation in the folder go: they are of other runs.
-    with staged(folder, EVALUATION_FILES) as stage:
+    # The files of another run in the folder go.
+    with staged(folder, RUN_FILES) as stage:
         text = table.to_csv(index=False)
         write_atomically(stage / "judged.csv", text)
         cli.write_summary(stage, summary)

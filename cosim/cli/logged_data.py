@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 KNOWN = "known.png"
 """Figure of what the log says of the model."""
-ANSWER_FILES = (PARAMETERS, "summary.json", "scenario.toml", KNOWN)
-"""Files of a training from logged data."""
 DataOption = Annotated[
     Path | None,
     typer.Option("--data", help="CSV file of logged data, in place of the plant."),
@@ -70,7 +68,7 @@ def train_from_data(
     options: TrainingOptions,
     columns: list[str] | None,
     leave_out: list[str] | None,
-    out: Path,
+    folder: Path,
     output: cli.Output,
 ) -> None:
     """Learn θ from a log; write parameters.toml, known.png, summary.json and scenario.toml.
@@ -83,14 +81,14 @@ def train_from_data(
         options: start, seed and controller of them count.
         columns: texts NAME=COLUMN.
         leave_out: texts COLUMN=VALUE.
-        out: folder of the files.
+        folder: of the files.
         output: where tables go.
     """
     from cosim.core.files import staged, write_atomically
+    from cosim.core.run_files import RUN_FILES
     from cosim.figures.logged_data import known_figure
     from learning.from_data import train_from_data
 
-    folder = cli.open_folder(out)
     answer = train_from_data(
         algorithm,
         data,
@@ -103,7 +101,7 @@ def train_from_data(
         leave_out=leave_out or (),
     )
     summary = answer.summary()
-    with staged(folder, ANSWER_FILES) as stage:
+    with staged(folder, RUN_FILES) as stage:
         answer.parameters.save(stage / PARAMETERS)
         write_atomically(stage / "scenario.toml", answer.run.scenario.to_toml())
         cli.write_summary(stage, summary)

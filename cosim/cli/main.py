@@ -33,6 +33,7 @@ from cosim.cli import (
 from cosim.cli.output import descriptions
 from cosim.core.errors import CosimError, CosimWarning
 from cosim.core.files import protect
+from cosim.core.modules import users_place
 from cosim.core.processes import Interrupted, Terminated, command_process, unwound
 
 OUTPUT_OPTIONS = ("--out", "-o", "--png", "--ssp", "--record")
@@ -231,8 +232,8 @@ def options(
 def main() -> None:
     """Run the command line.
 
-    Bad input ends in one line on standard error and exit code 2. An unforeseen error ends in one
-    line, a report with the traceback and exit code 70.
+    Bad input, and a mistake in a plug-in, end in one line on standard error and exit code 2. An
+    unforeseen error ends in one line, a report with the traceback and exit code 70.
     """
     # NumPy's import starts BLAS's threads: 15 % of a short run's time, and of no use to small
     # matrices.
@@ -302,6 +303,10 @@ def _run_app() -> None:
             _fail(f"{name}{error.strerror or error}")
         if isinstance(error, CosimError):
             _fail(str(error))
+        # The user's own code is the user's to mend.
+        place = users_place(error)
+        if place:
+            _fail(f"{place}: {type(error).__name__}: {error}")
         _report(error)
 
 
@@ -325,7 +330,7 @@ def _report(error: BaseException) -> None:
         traceback.print_exception(error, file=file)
     text = " ".join(f"{type(error).__name__}: {error}".split())
     print(
-        f"error: unforeseen, a mistake in cosim or in a plug-in: {text}; the report is in "
+        f"error: unforeseen, a mistake in cosim: {text}; the report is in "
         f"{file.name}: please send it to the maintainers with the command",
         file=sys.stderr,
     )

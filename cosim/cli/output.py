@@ -8,7 +8,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,12 +18,15 @@ import typer
 from cosim.core.errors import CosimError
 from cosim.core.files import hold, release, write_atomically
 from cosim.core.processes import Terminated, redirected_output
+from cosim.core.run_files import RUN_FILES, STUDY_MARKS
 from cosim.core.training_options import MOST
 
 MOST_DRAWN = 20_000
 """Samples of the longest run that is drawn: more are a grey band, and take seconds."""
 FOLDED_WIDTH = 14
 """Characters that a column of folded texts has at least."""
+_made: list[Path] = []
+"""Folders that this command has made, each behind the one that it is in."""
 LONG_DOCUMENT = 1 << 20
 """Bytes from which on a JSON document is written on one line: what is indented Python writes."""
 
@@ -63,6 +66,10 @@ ScenarioOption = Annotated[
 StepsOption = Annotated[int, count("--steps", "-n", text="Number of samples.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the disturbances.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")]
+OverwriteOption = Annotated[
+    bool,
+    typer.Option("--overwrite", help="Replace the files of another run that the folder holds."),
+]
 RecordOption = Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")]
 JobsOption = Annotated[
     int | None,
@@ -239,6 +246,8 @@ def _is_number(cell: str) -> bool:
 def output(as_json: bool) -> Iterator[Output]:
     """Open a command's output; its folders' locks are released at the end.
 
+    Folders that the command made and left empty, as one that was refused does, go.
+
     With JSON, file descriptor 1 is turned to standard error meanwhile, since an FMU or a solver
     is native code that may print.
     """
@@ -249,6 +258,10 @@ def output(as_json: bool) -> Iterator[Output]:
             yield result
         finally:
             release()
+            while _made:
+                # None that holds a file, or another process's lock, can be removed.
+                with suppress(OSError):
+                    _made.pop().rmdir()
 
 
 @contextmanager
@@ -322,13 +335,55 @@ def dump(document: Mapping[str, Any]) -> str:
     return f"{text}\n"
 
 
-def open_folder(folder: Path) -> Path:
-    """A `writable_folder`, absolute since an FMU may change the working directory, and held.
+def open_folder(
+    folder: Path,
+    overwrite: bool,
+    instead: str = "replace it by --overwrite",
+) -> Path:
+    """The folder of a run: a `writable_folder`, held, absolute since an FMU may change directories.
 
-    Raises CosimError before the work where another process holds it.
+    Args:
+        folder: `--out`.
+        overwrite: whether files of another run may be replaced.
+        instead: what the user may do where the folder holds such files.
+
+    Raises:
+        CosimError: before the work, where another process holds it, or it holds another run.
     """
     hold(writable_folder(folder))
+    study = _first_of(folder, STUDY_MARKS)
+    # It may have taken days, and no single run replaces all of it.
+    if study:
+        raise CosimError(f"folder '{folder}' holds a study ({study}): choose another --out")
+    file = _first_of(folder, RUN_FILES)
+    if file and not overwrite:
+        raise CosimError(
+            f"folder '{folder}' holds another run ({file}): {instead}, or choose another --out"
+        )
     return folder.absolute()
+
+
+def open_study_folder(folder: Path) -> Path:
+    """The folder of a study, as `open_folder` has it; a study goes on in its own.
+
+    Raises CosimError where another process holds it, or it holds a run that is no study.
+    """
+    hold(writable_folder(folder))
+    # Its own scenarios may lie there: no study writes scenario.toml.
+    file = _first_of(folder, [name for name in RUN_FILES if name != "scenario.toml"])
+    if file and not _first_of(folder, STUDY_MARKS):
+        raise CosimError(
+            f"folder '{folder}' holds a run that is no study ({file}): choose another --out"
+        )
+    return folder.absolute()
+
+
+def _first_of(folder: Path, patterns: Sequence[str]) -> str:
+    """Name of the first file in a folder that a pattern fits; empty where none does."""
+    for pattern in patterns:
+        for path in folder.glob(pattern):
+            return str(path.relative_to(folder))
+    return ""
 
 
 def split_names(text: str) -> list[str]:
@@ -341,8 +396,13 @@ def split_names(text: str) -> list[str]:
 
 def writable_folder(folder: Path) -> Path:
     """Create a folder and make sure, before the work, that it can be written."""
+    missing = [path for path in folder.absolute().parents if not path.exists()]
+    missing.reverse()
+    if not folder.exists():
+        missing.append(folder.absolute())
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _made.extend(missing)
         # Permissions do not tell all: a disk may be full, or mounted for reading alone.
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".cosim-"):
             pass

@@ -11,9 +11,6 @@ import cosim
 from cosim.cli import logged_data
 from cosim.cli import output as cli
 
-SHADOW_FILES = ("shadow.csv", "shadow.png", "summary.json", "scenario.toml", "shadow.rrd")
-"""Files of a shadow; all in a folder belong to one."""
-
 
 def shadow(
     controller: str,
@@ -23,6 +20,7 @@ def shadow(
     leave_out: logged_data.LeaveOutOption = None,
     out: cli.OutOption = Path("cosim-shadow"),
     record: cli.RecordOption = False,
+    overwrite: cli.OverwriteOption = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Show the actions that a controller would have applied to logged data.
@@ -40,6 +38,7 @@ def shadow(
         from controllers.problem import Problem
         from cosim.core.files import staged
         from cosim.core.logged_data import read_log
+        from cosim.core.run_files import RUN_FILES
         from cosim.shadow import given_names, shadow
 
         loaded = cosim.Scenario.load(scenario)
@@ -56,10 +55,10 @@ def shadow(
             leave_out=leave_out or (),
             given=given_names(law, loaded),
         )
-        folder = cli.open_folder(out)
+        folder = cli.open_folder(out, overwrite)
         result = shadow(law, table, loaded)
         summary = result.summary()
-        with staged(folder, SHADOW_FILES) as stage:
+        with staged(folder, RUN_FILES) as stage:
             result.write_csv(stage / "shadow.csv")
             if 1 < len(result) <= cli.MOST_DRAWN:
                 result.plot(stage / "shadow.png")

@@ -11,11 +11,6 @@ import typer
 import cosim
 from cosim.cli import output as cli
 
-SIMULATION_FILES = (
-    "trajectory.csv", "trajectory.parquet", "trajectory.png", "timing.csv", "timing.parquet",
-    "summary.json", "scenario.toml", "run.rrd",
-)  # fmt: skip
-"""Files of a run; all in a folder belong to one."""
 LONG_TABLE = 100_000
 """Samples of the longest run that is written as text: that takes as long as the run."""
 
@@ -28,6 +23,7 @@ def simulate(
     out: cli.OutOption = Path("cosim-run"),
     plot: Annotated[bool, typer.Option("--plot")] = False,
     record: cli.RecordOption = False,
+    overwrite: cli.OverwriteOption = False,
     json: cli.JsonOption = False,
 ) -> None:
     """Run a controller on a scenario's plant.
@@ -49,14 +45,15 @@ def simulate(
     with cli.output(json) as out_:
         from cosim.core.errors import CosimError, PlantError
         from cosim.core.files import staged
+        from cosim.core.run_files import RUN_FILES
 
         # Before the run, which may take long.
         if plot and not 1 < steps <= cli.MOST_DRAWN:
             raise CosimError(f"--plot draws 2 to {cli.MOST_DRAWN} samples, not {steps}")
         loaded = cosim.Scenario.load(scenario)
-        folder = cli.open_folder(out)
+        folder = cli.open_folder(out, overwrite)
         out_.announce(loaded.plant.fmu)
-        with staged(folder, SIMULATION_FILES) as stage:
+        with staged(folder, RUN_FILES) as stage:
             summary = _simulate(loaded, controller, steps, seed, stage, plot, record, out_.live)
             cli.write_summary(stage, summary)
         rows = [

@@ -62,7 +62,7 @@ def _execute(
     from cosim.studies.plan import plan
 
     definition = cosim.Study.load(file)
-    folder = cli.open_folder(out)
+    folder = cli.open_study_folder(out)
     for scenario in definition.scenarios.values():
         out_.announce(scenario.plant.fmu)
     planned = plan(definition)

@@ -11,7 +11,6 @@ import typer
 import cosim
 from cosim.cli import logged_data
 from cosim.cli import output as cli
-from cosim.core.errors import CosimError
 from cosim.core.training_options import TrainingOptions, option_ranges, with_training_options
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ def train(
     leave_out: logged_data.LeaveOutOption = None,
     out: cli.OutOption = Path("cosim-train"),
     resume: Annotated[bool, typer.Option("--resume")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
+    overwrite: cli.OverwriteOption = False,
     assignments: Annotated[list[str] | None, typer.Option("--set")] = None,
     explain: Annotated[bool, typer.Option("--explain")] = False,
     gif: Annotated[bool, typer.Option("--gif")] = False,
@@ -58,7 +57,6 @@ def train(
         algorithm: Name of a rule, or module:Class.
         samples: Plant samples; default: the algorithm's, or 50 000.
         resume: Continue from the folder's checkpoint.
-        overwrite: Start again if the folder holds another run.
         assignments: Hyperparameter as NAME=VALUE; may be repeated.
         explain: List the algorithm's hyperparameters and stop.
         gif: Draw learning.gif too: the loop while θ is learned.
@@ -67,9 +65,10 @@ def train(
     with cli.output(json) as out_:
         from controllers.factories import stored_optimum
         from cosim.core.files import staged
+        from cosim.core.run_files import RUN_FILES
         from cosim.core.training_options import CHECKPOINT
         from learning.algorithm import load_algorithm
-        from learning.training import TRAINING_FILES, run_training
+        from learning.training import run_training
         from learning.training_run import make_run
         from learning.verdict import WORSE
 
@@ -89,7 +88,7 @@ def train(
                 TrainingOptions(**options),
                 columns,
                 leave_out,
-                out,
+                cli.open_folder(out, overwrite),
                 out_,
             )
             return
@@ -101,14 +100,12 @@ def train(
             rule.Configuration.from_assignments(assignments or []),
             TrainingOptions(**options),
         )
-        folder = cli.open_folder(out)
-        there = [name for name in TRAINING_FILES if (folder / name).exists()]
         # A training may have taken hours: it is replaced by an order alone.
-        if there and not (resume or overwrite):
-            raise CosimError(
-                f"folder '{folder}' holds another training ({there[0]}); go on with it by "
-                "--resume, start again by --overwrite, or choose another --out"
-            )
+        folder = cli.open_folder(
+            out,
+            resume or overwrite,
+            "go on with it by --resume, start again by --overwrite",
+        )
         out_.announce(run.scenario.plant.fmu)
         checkpoint = folder / CHECKPOINT
 
@@ -132,7 +129,7 @@ def train(
         timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
         summary = training.summary() | {"timing": timing}
         # The checkpoint was written during the training, and stays.
-        files_of_this_run = set(TRAINING_FILES) - {CHECKPOINT}
+        files_of_this_run = set(RUN_FILES) - {CHECKPOINT}
         with staged(folder, files_of_this_run) as stage:
             training.write_files(stage)
             if gif:

@@ -158,6 +158,24 @@ def exception_line(cause: BaseException) -> str:
     return line
 
 
+def users_place(cause: BaseException) -> str:
+    """Where in a user's code an exception arose, `FILE:LINE, in FUNCTION`; empty where in none.
+
+    A user's code is what plug-ins were loaded from, but for what is installed.
+    """
+    users_places = [place for place, _ in _users_places()]
+    our_folders = [ROOT / name for name in OURS]
+    frames = traceback.extract_tb(cause.__traceback__)
+    # The last one: what it calls of others' code raises what the user's call led to.
+    for frame in reversed(frames):
+        path = Path(frame.filename).absolute()
+        is_users = any(path.is_relative_to(place) for place in users_places)
+        is_ours = any(path.is_relative_to(folder) for folder in our_folders)
+        if is_users and not is_ours and not _is_installed(path):
+            return f"{frame.filename}:{frame.lineno}, in {frame.name}"
+    return ""
+
+
 def _top(module: str) -> str:
     """The package of a module, or the module itself where it is in none."""
     top, _, _ = module.partition(".")

@@ -262,5 +262,7 @@ def study(
         name, failure = next(iter(runner.failures.items()))
         more = len(runner.failures) - 1
         others = f" ({more} more failed)" if more else ""
-        raise FailedRunsError(f"{name}: {failure.message}{others}; run the command again")
+        raise FailedRunsError(
+            f"{name}: {failure.message}{others}; once that is mended, the same command goes on"
+        )
     return results

@@ -118,3 +118,34 @@ def test_a_command_loads_no_library_that_it_does_not_need(tmp_path, words, heavy
         [sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True
     )
     assert result.stderr.splitlines()[-1] == ""
+
+
+def test_a_run_is_not_mixed_with_another_commands(cosim, tmp_path):
+    assert cosim("simulate", "--steps", 3, "--out", "one")[0] == 0
+    kept = {path: path.read_bytes() for path in (tmp_path / "one").iterdir()}
+    evaluate = ("evaluate", "--seeds", 2, "--steps", 3, "--jobs", 1, "--out", "one")
+    code, _, err = cosim(*evaluate)
+    assert code == 2 and "holds another run (trajectory.csv)" in err and err.count("\n") == 1
+    assert kept == {path: path.read_bytes() for path in (tmp_path / "one").iterdir()}
+    assert cosim(*evaluate, "--overwrite")[0] == 0
+    left = {path.name for path in (tmp_path / "one").iterdir()}
+    assert left == {"evaluation.csv", "timing.csv", "summary.json", "scenario.toml"}
+
+
+def test_a_study_is_neither_replaced_by_a_run_nor_put_beside_one(cosim, tmp_path):
+    for folder, file in (("study", "study.json"), ("run", "trajectory.csv")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / file).touch()
+    code, _, err = cosim("simulate", "--steps", 3, "--out", "study", "--overwrite")
+    assert code == 2 and "holds a study" in err
+    (tmp_path / "mine.toml").write_text(
+        'schema = 1\nname = "m"\nscenarios = ["paper"]\n'
+        'evaluation = { seeds = 1, steps = 2 }\n[[case]]\ncontroller = "naive"\n'
+    )
+    code, _, err = cosim("study", "run", "mine.toml", "--out", "run")
+    assert code == 2 and "no study (trajectory.csv)" in err
+
+
+def test_a_refused_command_leaves_no_empty_folder(cosim, tmp_path):
+    assert cosim("simulate", "-c", "nowhere", "--out", "a/b")[0] == 2
+    assert not (tmp_path / "a").exists()

@@ -249,7 +249,7 @@ def test_a_comparison_sees_every_change(runs, what):
 ENDS = {
     "sys.exit(0)": ("sys.exit(0)", 2, "exit(0)"),
     "a closed pipe": ("raise BrokenPipeError", 2, "pipe"),
-    "no Exception": ("raise BaseException('x')", 70, "BaseException: x"),
+    "no Exception": ("raise BaseException('x')", 2, "in feedback: BaseException: x"),
 }
 PLUGIN = """\
 import sys

@@ -87,7 +87,7 @@ def test_a_full_disk_is_one_line_and_old_files_stay(tmp_path):
     words = "simulate --steps 400 --out out"
     assert command_line(tmp_path, *words.split()).returncode == 0
     before = {path: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}
-    again = [*words.split(), "--seed", "1"]
+    again = [*words.split(), "--seed", "1", "--overwrite"]
     assert "File too large" in refused(command_line(tmp_path, *again, limit=8000))
     after = {path: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}
     assert after.keys() == before.keys()

@@ -13,7 +13,7 @@ from cosim.core.simulation import spawn_seeds
 from cosim.core.training_options import HELD_OUT
 from learning import QLearning
 from learning.algorithm import Update
-from learning.errors import PrivilegeError
+from learning.errors import ConfigurationError, PrivilegeError
 from learning.exploration import Strategy
 from learning.loop import PlantInOperation, TrainingLoop
 from learning.training import run_training
@@ -161,6 +161,15 @@ class Privileged(Asking):
 
 def asking(plant, base, **says):
     return begin_training(make_run(plant.scenario), type("Own", (base,), {"says": says}), plant)
+
+
+def test_what_is_no_update_is_named(plant):
+    returning_theta = {"observe": lambda rule, sample: np.zeros(3)}
+    loop = begin_training(
+        make_run(plant.scenario), type("Own", (QLearning,), returning_theta), plant
+    )
+    with pytest.raises(ConfigurationError, match="must return None or Update, got ndarray"):
+        loop.advance()
 
 
 def test_a_plant_in_operation_is_never_reset(plant):

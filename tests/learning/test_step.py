@@ -114,6 +114,13 @@ def test_a_free_step_that_is_definite_is_taken_as_it_is(blocks, parameters, rng)
     assert not update.corrected
 
 
+def test_a_theta_of_another_shape_is_told(parameters):
+    size = parameters.theta.size
+    step = ConstrainedStep(Carrier(parameters), Configuration())
+    with pytest.raises(ValueError, match=rf"θ has shape \({size - 1},\), needs \({size},\)"):
+        step.move(parameters.theta[1:])
+
+
 def test_lmi_step_equals_a_generic_conic_solution(blocks, parameters, rng):
     theta = parameters.theta
     for _ in range(3):

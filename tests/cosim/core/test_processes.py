@@ -91,7 +91,9 @@ def test_a_child_has_its_exit_code_and_its_temporary_files_in_its_folder(tmp_pat
 def test_a_recording_of_another_run_does_not_stand_beside_the_signals(tmp_path):
     assert run_cosim("simulate", "-n", "20", "--record", "--out", tmp_path).returncode == 0
     assert (tmp_path / "run.rrd").exists()
-    assert run_cosim("simulate", "-n", "20", "--seed", "1", "--out", tmp_path).returncode == 0
+    again = ["simulate", "-n", "20", "--seed", "1", "--out", tmp_path]
+    assert run_cosim(*again).returncode == 2
+    assert run_cosim(*again, "--overwrite").returncode == 0
     assert not (tmp_path / "run.rrd").exists()
 
 

@@ -126,6 +126,8 @@ def test_a_failing_case_is_told_at_once_and_the_others_are_done(tmp_path):
     assert (tmp_path / "runs/paper/grow/0/evaluation.csv").is_file()
     trace = next(tmp_path.glob("runs/paper/broken/0/failure.txt")).read_text()
     assert "toy_study.py" in trace
+    (line,) = {line for line in lines if line.startswith("failed: broken on paper, seed 0")}
+    assert "toy_study.py:53, in observe: ZeroDivisionError" in line
 
 
 def test_sizes_may_differ_by_scenario_and_a_scenario_be_written_in_the_study(tmp_path):

@@ -49,7 +49,7 @@ from learning.evaluator import Evaluator, KnownCosts, number_if_known
 from learning.log import LOG_COLUMNS, METRICS, LogRow, to_csv
 from learning.step import smallest_eigenvalue
 from learning.training_run import TrainingRun, begin_training, make_run, most_evaluations
-from learning.verdict import NO_DIFFERENCE, WORSE, Verdict, verdict
+from learning.verdict import NO_DIFFERENCE, NOT_COMPARED, UNCHANGED, WORSE, Verdict, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -147,9 +147,38 @@ class Training(Result):
     @property
     def verdict(self) -> Verdict:
         """Whether the learned θ is shown to be better than the start, or worse."""
+        found = NO_DIFFERENCE
+        if self.run.evaluation_seeds:
+            found = verdict(self.difference)
+        # Of equal θ there is no difference to show.
+        if found == NO_DIFFERENCE and self._is_unchanged:
+            return UNCHANGED
         if not self.run.evaluation_seeds:
-            return NO_DIFFERENCE
-        return verdict(self.difference)
+            return NOT_COMPARED
+        return found
+
+    @property
+    def _is_unchanged(self) -> bool:
+        """Whether the learned θ is the start's."""
+        return np.array_equal(self.learned.theta, self.start.theta)
+
+    @property
+    def reason(self) -> str:
+        """Why θ is the start's, in words, as far as the log tells; empty where it has moved."""
+        if not self._is_unchanged:
+            return ""
+        if self.status != "finished":
+            return "the run ended before θ moved"
+        if not self.updates:
+            return "the rule made no update: more --samples may give it one"
+        n_refused = int(_total(row["refused"] for row in self.rows))
+        if n_refused == self.updates:
+            return (
+                f"all {n_refused} updates were refused, by the rule or by what keeps θ admissible"
+            )
+        if self.retreats:
+            return "θ went back to its start, which was shown to cost less"
+        return f"none of {self.updates} updates moved it"
 
     @property
     def parameters(self) -> Parameters:
@@ -327,6 +356,7 @@ class Training(Result):
             "status": self.status,
             "hyperparameters": run.configuration.model_dump(mode="json"),
             "verdict": self.verdict,
+            "reason": self.reason or None,
             "updates": self.updates,
             "predicted_cost": number_if_known(self.predicted_cost),
             "realised_cost": number_if_known(self.realised_cost),

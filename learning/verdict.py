@@ -9,11 +9,19 @@ import numpy as np
 from cosim.core.protocols import Array
 from cosim.core.statistics import Estimate, mean
 
-Verdict = Literal["better", "no difference shown", "worse: the start was kept"]
+Verdict = Literal[
+    "better",
+    "no difference shown",
+    "worse: the start was kept",
+    "θ was not changed",
+    "not compared: no held-out runs",
+]
 
 BETTER: Verdict = "better"
 NO_DIFFERENCE: Verdict = "no difference shown"
 WORSE: Verdict = "worse: the start was kept"
+UNCHANGED: Verdict = "θ was not changed"
+NOT_COMPARED: Verdict = "not compared: no held-out runs"
 
 
 def verdict(difference: Estimate) -> Verdict:

@@ -189,6 +189,10 @@ def _gain(summary: dict[str, Any], name: str, samples: int) -> str:
     numbers = [round(100 * number, 2) for number in (gain["value"], low, high)]
     value, low, high = numbers
     learned = f"{name} after {samples} samples"
+    # A quotient's interval may leave out zero where that of the difference has it.
+    ends = pair["differences"]["J"]["interval"]
+    if ends is not None and ends[0] <= 0 <= ends[1]:
+        return f"{learned} cannot be told from {START}"
     if low > 0:
         return f"{learned} costs {value:.2f} % [{low:.2f}, {high:.2f}] less than {START}"
     if high < 0:

@@ -202,13 +202,18 @@ def show_evaluation(
 
 def _show_pairs(summary: dict[str, Any], output: cli.Output) -> None:
     """Print the paired difference of each two controllers."""
+    from cosim.core.statistics import shown
+
     rows = []
     for comparison in summary["comparisons"]:
         difference = _interval(comparison["differences"]["J"])
-        gain = _interval(comparison["gain_in_J"], 100.0)
+        # Without an interval: a quotient's of few seeds may leave out zero where that of the
+        # difference has it, and the two have the same sign.
+        value = comparison["gain_in_J"]["value"]
+        gain = shown(value, None, 100.0, 3) if isfinite(value) else ""
         rows.append((comparison["controller"], comparison["reference"], difference, gain))
     header = ("controller", "against", "difference in J", "gain in J %")
-    output.table("paired over the seeds, with 95 % intervals", header, rows)
+    output.table("paired over the seeds, with 95 % intervals of the difference", header, rows)
 
 
 def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:

@@ -70,7 +70,7 @@ def train(
         from learning.algorithm import load_algorithm
         from learning.training import run_training
         from learning.training_run import make_run
-        from learning.verdict import WORSE
+        from learning.verdict import NO_DIFFERENCE, WORSE
 
         # Neither a scenario nor a folder is needed to explain a rule.
         rule = load_algorithm(algorithm)
@@ -140,6 +140,11 @@ def train(
                 record_training(stage / "training.rrd", training)
             cli.write_summary(stage, summary)
         _show_training(summary, out_)
+        if training.verdict == NO_DIFFERENCE:
+            out_.note(
+                f"no difference is shown by {run.evaluation_seeds} held-out runs: more narrow the "
+                "interval, by --evaluation-seeds"
+            )
         out_.note(f"the learning curve is {folder / 'learning.png'}")
         out_.json(summary)
     # All files are written before: a script that sees the code can read why.
@@ -170,16 +175,18 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
     form = "{algorithm} ({requires}) on {scenario}, {samples} samples, seed {seed}: {status}"
     title = form.format(**summary)
     rows = [("verdict", summary["verdict"])]
+    if summary["reason"]:
+        rows.append(("reason", summary["reason"]))
     if summary["evaluation_seeds"]:
         difference = shown(summary["difference"], summary["difference_interval"], 1, 3)
         rows += [
             ("J of the start, on held-out noise", shown(summary["start_J"], digits=6)),
             ("J of the learned θ, on the same", shown(summary["J"], digits=6)),
             ("difference", difference),
-            ("economic cost", shown(summary["economic_cost"], digits=6)),
-            ("mean violation", f"{summary['mean_violation']:.6f}"),
-            ("violating share", f"{100 * summary['violating_share']:.2f} %"),
-            ("failures", str(summary["failures"])),
+            ("economic cost of the learned θ", shown(summary["economic_cost"], digits=6)),
+            ("mean violation of the learned θ", f"{summary['mean_violation']:.6f}"),
+            ("violating share of the learned θ", f"{100 * summary['violating_share']:.2f} %"),
+            ("failures of the learned θ", str(summary["failures"])),
         ]
     rows += [
         ("updates", str(summary["updates"])),
@@ -187,8 +194,8 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
         ("retreats", str(summary["retreats"])),
         ("cost that the rule predicted", _or_none(summary["predicted_cost"])),
         ("cost since the last update", _or_none(summary["realised_cost"])),
-        ("plant samples", str(summary["plant_samples"])),
-        ("plant samples of held-out runs, beside", str(summary["held_out_samples"])),
+        ("plant samples of the training", str(summary["plant_samples"])),
+        ("plant samples of the held-out runs", str(summary["held_out_samples"])),
     ]
     # Both need an optimum of the scenario, which `cosim optimum` stores.
     if summary["regret"] is not None:
@@ -196,5 +203,5 @@ def _show_training(summary: dict[str, Any], output: cli.Output) -> None:
         rows.append(("regret %", regret))
     if summary["gap_closed"] is not None:
         gap = shown(summary["gap_closed"], None, 100, 4)
-        rows.append(("share of the start's regret that is gone, %", gap))
+        rows.append(("regret removed, %", gap))
     output.table(title, ("per sample", "value"), rows)

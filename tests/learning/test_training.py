@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -67,7 +69,7 @@ def test_the_held_out_samples_are_those_that_the_plant_took(scenario, seeds, mon
 def test_without_held_out_runs_no_verdict_is_made_up(scenario, tmp_path):
     run = make_run(scenario, "q-learning", evaluation_seeds=0)
     result = run_training(run)
-    assert (result.status, result.verdict) == ("finished", "no difference shown")
+    assert (result.status, result.verdict) == ("finished", "not compared: no held-out runs")
     assert np.array_equal(result.parameters.theta, result.learned.theta)
     assert np.isnan([result.J, result.start_J, result.regret, result.difference.value]).all()
     assert np.isnan(result.log()["greedy_J"]).all()
@@ -130,11 +132,14 @@ def test_where_theta_is_worse_than_the_start_the_start_is_kept(scenario, tmp_pat
     assert np.array_equal(stored.theta, result.start.theta)
 
 
-def test_a_theta_that_stays_shows_no_difference(scenario):
+def test_a_theta_that_stays_is_told_with_the_reason(scenario):
     run = training.make_run("fixed", scenario, start="tuned", evaluation_seeds=3)
     result = run_training(run)
-    assert (result.verdict, result.difference.value) == ("no difference shown", 0.0)
+    assert (result.verdict, result.difference.value) == ("θ was not changed", 0.0)
     assert result.updates == 0
+    assert "the rule made no update" in result.summary()["reason"]
+    diverged = dataclasses.replace(result, status="diverged: at once")
+    assert diverged.reason == "the run ended before θ moved"
 
 
 class Predicting(QLearning):

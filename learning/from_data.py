@@ -20,7 +20,15 @@ from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.core.logged_data import LoggedData, LoggedDataError, read_log, transitions_of
+from cosim.core.logged_data import (
+    FEWEST,
+    LoggedData,
+    LoggedDataError,
+    LogTable,
+    check_sizes,
+    read_log,
+    transitions_of,
+)
 from cosim.core.logged_readings import LoggedReadings, readings_of
 from cosim.core.protocols import Array, Step, Vector
 from cosim.core.scenario import Scenario
@@ -42,7 +50,7 @@ from learning.log_answer import (
     moved_bounds,
     moves_of,
 )
-from learning.log_checks import inputs_and_outputs, usable
+from learning.log_checks import inputs_and_outputs, plausible, usable
 from learning.log_configuration import LogConfiguration
 from learning.log_prediction import Prediction, difference
 from learning.loop import TrainingLoop
@@ -146,6 +154,42 @@ def _check_run(run: TrainingRun) -> None:
             f"scenario '{run.scenario.name}' has signals, which a log does not hold: train without "
             "--data, in operation"
         )
+
+
+def doubts_of(table: LogTable, scenario: Scenario) -> list[str]:
+    """Why a training would refuse a log, or what of it it would leave out; in words, a line each.
+
+    Args:
+        table: its rows, with states.
+        scenario: has no sensors.
+
+    Returns:
+        None of a log that is too short to tell.
+    """
+    settings = ModelBasedConfiguration.from_dict({}).for_scenario(scenario)
+    try:
+        check_sizes(table, scenario, scenario.plant.states)
+        if len(table.time) <= FEWEST:
+            return []
+        # Without its stage cost, which has no part in what a controller does.
+        data = replace(transitions_of(table, scenario), stage_cost=None)
+        problem = _with_nominal_cost(Problem.from_scenario(scenario))
+        features = Features(problem, settings.smallest_error_size)
+        with threadpool_limits(limits=1, user_api="blas"):
+            data = plausible(data, scenario, features, settings, LogConfiguration.of({}))
+    except LoggedDataError as error:
+        return [str(error)]
+    doubts = []
+    for reason, count in data.left_out.items():
+        is_known = reason in (
+            "by order",
+            "repeated row",
+            "missing value",
+            "older than what is used",
+        )
+        if not is_known:
+            doubts.append(f"{reason}: {count} pairs of rows")
+    return doubts
 
 
 def _train(

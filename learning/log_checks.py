@@ -44,10 +44,7 @@ def usable(
     Raises:
         LoggedDataError: the log is doubtful, or too little of it is left.
     """
-    data = data.latest(settings.memory)
-    _check_order(data, scenario, features, settings, log_settings)
-    _check_units(data, scenario, features, log_settings)
-    data = data.without(_there_and_back(data, features, log_settings), "jump there and back")
+    data = plausible(data, scenario, features, settings, log_settings)
     inputs, outputs = inputs_and_outputs(data, features)
     n_outdated = PlantData(features, settings).outdated(inputs, outputs)
     before_a_change = np.arange(len(data)) < n_outdated
@@ -62,6 +59,25 @@ def usable(
             f"are {', '.join(counts) or 'none'}; log longer, or leave out less"
         )
     return used
+
+
+def plausible(
+    data: LoggedData,
+    scenario: Scenario,
+    features: Features,
+    settings: EmpiricalModelConfiguration,
+    log_settings: LogConfiguration,
+) -> LoggedData:
+    """The latest transitions without jumps that no plant makes; arguments are those of `usable`.
+
+    Raises:
+        LoggedDataError: the log speaks for another reading of itself, or the model makes nothing of
+            it.
+    """
+    data = data.latest(settings.memory)
+    _check_order(data, scenario, features, settings, log_settings)
+    _check_units(data, scenario, features, log_settings)
+    return data.without(_there_and_back(data, features, log_settings), "jump there and back")
 
 
 def inputs_and_outputs(data: LoggedData, features: Features) -> tuple[Array, Array]:
@@ -457,6 +473,9 @@ def _jump_back(
         follows: whether the transition before ends where this one begins, (M,).
         settings: how large a jump back is, and how soon it comes.
     """
+    # A reading that stands still has not jumped, however the model errs.
+    if change[there] == 0:
+        return None
     largest = settings.largest_jump_ratio
     end = min(there + 1 + settings.longest_dropout, len(size))
     for later in range(there + 1, end):

@@ -40,6 +40,7 @@ def shadow(
         from cosim.core.logged_data import read_log
         from cosim.core.run_files import RUN_FILES
         from cosim.shadow import given_names, shadow
+        from learning.from_data import doubts_of
 
         loaded = cosim.Scenario.load(scenario)
         law = cosim.build_controller(controller, loaded)
@@ -57,7 +58,10 @@ def shadow(
         )
         folder = cli.open_folder(out, overwrite)
         result = shadow(law, table, loaded)
-        summary = result.summary()
+        doubts = []
+        if loaded.controller.model and result.given_names == loaded.plant.states:
+            doubts = doubts_of(table, loaded)
+        summary = result.summary() | {"doubts": doubts}
         with staged(folder, RUN_FILES) as stage:
             result.write_csv(stage / "shadow.csv")
             if 1 < len(result) <= cli.MOST_DRAWN:
@@ -98,5 +102,7 @@ def shadow(
         out_.table(title, header, rows)
         for reason, count in summary["left_out"].items():
             out_.note(f"left out: {count} × {reason}")
+        for doubt in doubts:
+            out_.note(f"in doubt, as `cosim train --data` has it: {doubt}")
         out_.note(f"files are in {out.resolve()}")
         out_.json(summary)

@@ -23,6 +23,7 @@ def test_shadow_writes_its_files(cosim, log, tmp_path, monkeypatch):
     summary = json.loads(out)
     assert summary == json.loads((tmp_path / "shadow/summary.json").read_text())
     assert summary["samples"] == 150
+    assert summary["doubts"] == []
     assert {path.name for path in (tmp_path / "shadow").iterdir()} == {
         "shadow.csv",
         "shadow.png",
@@ -31,6 +32,20 @@ def test_shadow_writes_its_files(cosim, log, tmp_path, monkeypatch):
     }
     header = (tmp_path / "shadow/shadow.csv").read_text().splitlines()[0]
     assert header == "time [s],X2,P2,P100,proposed[P100],F200,proposed[F200],status"
+
+
+def test_a_shadow_says_what_a_training_would_refuse(cosim, log, tmp_path):
+    header, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    place = header.index("P2 [kPa]")
+    for row in rows:
+        row[place] = repr(1.8 * float(row[place]) + 32.0)
+    path = tmp_path / "other_unit.csv"
+    path.write_text("\n".join(map(",".join, [header, *rows])) + "\n")
+    code, _, err = cosim("shadow", "pi", "--data", path, "--out", "shadow")
+    refused, _, message = cosim("train", "-a", "model-based", "--data", path, "--out", "trained")
+    assert (code, refused) == (0, 2)
+    (doubt,) = [line for line in err.splitlines() if line.startswith("in doubt")]
+    assert "another unit" in doubt and doubt.split(": ", 1)[1] in message
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from math import hypot, isfinite
 from typing import NamedTuple
@@ -156,6 +156,15 @@ def paper_table(study: StudyMeasurements) -> TextTable:
     return title, header, rows
 
 
+def _cheaper(ratios: Sequence[float]) -> str:
+    """What (b) costs beside (a), from the least to the greatest J(b)/J(a), in words."""
+    words = []
+    for ratio in (min(ratios), max(ratios)):
+        side = "cheaper" if ratio <= 1 else "dearer"
+        words.append(f"{100 * abs(1 - ratio):.0f} % {side}")
+    return f"it is {' to '.join(dict.fromkeys(words))}"
+
+
 def paper_verdict(study: StudyMeasurements) -> dict[str, str]:
     """The paper's claim, what was found, and whether that reproduces it and why, a line each."""
     claim = (
@@ -184,8 +193,8 @@ def paper_verdict(study: StudyMeasurements) -> dict[str, str]:
     else:
         ratios = [gains.ratio for gains in every]
         verdict = (
-            f"not reproduced: none is within {NEAR:.0f} % of both. The claim implies "
-            f"J(b)/J(a) = {IMPLIED_RATIO:.2f}; without any learning it is "
-            f"{min(ratios):.2f} to {max(ratios):.2f} here"
+            f"not reproduced: none is within {NEAR:.0f} % of both. The paper's two gains need (b) "
+            f"{100 * (1 - IMPLIED_RATIO):.0f} % cheaper than (a); here, without any learning, "
+            f"{_cheaper(ratios)}"
         )
     return {"claim": claim, "found": found, "verdict": verdict}

@@ -799,6 +799,9 @@ class Runner:
         stores = self.stores.values()
         n_complete = sum(store.complete for store in stores)
         state = f"{n_complete}/{len(stores)} runs"
+        n_diverged = sum(store.status.startswith("diverged") for store in stores)
+        if n_diverged:
+            state += f", {n_diverged} diverged"
         if self.failures:
             state += f", {len(self.failures)} failed"
         samples_done = samples_at_work + sum(store.done for store in stores)

@@ -112,6 +112,18 @@ def test_burn_in_is_run_and_not_counted(tmp_path):
     assert row[:4] == ["100000", "20", "10", repr(float(cost))]
 
 
+def test_runs_that_diverge_are_counted_as_they_do(tmp_path):
+    states = []
+    run_toy(
+        tmp_path,
+        case=[case("lost", "Diverge", samples=300)],
+        training_seeds={"count": 1},
+        report=lambda *state: states.append(state[1]),
+    )
+    assert "2/3 runs, 1 diverged" in states
+    assert states[-1] == "3/3 runs, 1 diverged"
+
+
 @pytest.mark.slow
 def test_a_failing_case_is_told_at_once_and_the_others_are_done(tmp_path):
     lines = []

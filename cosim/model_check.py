@@ -58,8 +58,10 @@ class ModelDifference:
 
     def __str__(self) -> str:
         point = ", ".join(f"{name} = {value:.5g}" for name, value in self.where.items())
+        # "1" is FMI's unit of a number without dimension.
+        unit = "" if self.unit in ("", "1") else f" {self.unit}"
         return (
-            f"{self.name}: differs by at most {self.difference:.3g} {self.unit} "
+            f"{self.name}: differs by at most {self.difference:.3g}{unit} "
             f"({100 * self.share:.3g} % of what it varies): FMU {self.fmu:.6g}, model "
             f"{self.model:.6g} at {point}"
         )

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, get_args
 import numpy as np
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
-from cosim.core.modules import ALGORITHMS, load_plugin, registered
+from cosim.core.modules import ALGORITHMS, load_plugin, registered, target_in_file
 from cosim.core.protocols import Vector
 from cosim.core.scenario import Penalty, Scenario
 from cosim.core.signals import Known
@@ -190,6 +190,11 @@ def algorithms() -> list[str]:
 def load_algorithm(name: str) -> type[Algorithm]:
     """Class of an algorithm by registered name or `module:Class`; raises AlgorithmLookupError."""
     known = registered(ALGORITHMS)
+    if name.endswith(".py") and ":" not in name:
+        raise AlgorithmLookupError(
+            f"algorithm '{name}' is a file: give its class, {target_in_file(name)}, in the folder "
+            "of the file"
+        )
     if name not in known and ":" not in name:
         raise AlgorithmLookupError(
             f"unknown algorithm '{name}'{suggestion(name, known)}; registered are "

@@ -192,9 +192,9 @@ class GreedyConfiguration(Configuration):
 
 
 def _as_typed(value: object) -> str:
-    """A default as one types it behind `--set NAME=`; `nothing` where it is None."""
+    """A default as one types it behind `--set NAME=`; `unset` where it is None."""
     if value is None:
-        return "nothing"
+        return "unset"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -224,7 +224,8 @@ def _allowed(schema: Mapping[str, Any]) -> str:
         entries = schema["prefixItems"]
         return f"{len(entries)} × {_allowed(entries[0])}"
     if "items" in schema:
-        return f"list of {_allowed(schema['items'])}"
+        entry = _allowed(schema["items"])
+        return "names" if entry == "text" else f"list of {entry}"
     signs = {
         "exclusiveMinimum": ">",
         "minimum": "≥",
@@ -238,7 +239,7 @@ def _allowed(schema: Mapping[str, Any]) -> str:
     kind = str(schema.get("type", ""))
     words = {
         "boolean": "true, false",
-        "null": "nothing",
+        "null": "unset",
         "string": "text",
     }
     word = words.get(kind, kind)

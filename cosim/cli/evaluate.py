@@ -190,9 +190,9 @@ def show_evaluation(
     title = f"{summary['scenario']}, {summary['steps']} samples × {n_seeds} seeds"
     output.table(title, header, rows)
     if "remark" in summary:
-        output.note(summary["remark"])
+        output.legend(summary["remark"])
     if summary["optimum"] is not None:
-        output.note(
+        output.legend(
             "regret = (J − J*)/|J*| with its 95 % interval over the seeds; "
             f"J* = {shown(summary['optimal_J'], digits=6)}"
         )

@@ -31,7 +31,7 @@ def export(
     of θ are tunable parameters.
 
     Args:
-        controller: naive, tuned or a parameters file (.toml) of a training.
+        controller: naive, tuned, backed-off, cautious or a parameters file (.toml) of a training.
         out: The FMU's file; with --format c a folder.
         format_: fmu, or c: one .c and .h, no FMI.
         single: With --format c: float in place of double.

@@ -252,8 +252,12 @@ def tuning(
         from controllers.economic import tune
         from controllers.factories import value_offset
         from controllers.problem import Problem
+        from cosim.plant.fmi import unpack
+        from cosim.plant.fmu_plant import refuse_bounds_elsewhere
 
         task = cosim.Scenario.load(scenario)
+        # Bounds in another unit than the FMU's have no steady state.
+        refuse_bounds_elsewhere(task, unpack(task.plant.fmu))
         problem = Problem.from_scenario(task)
         result = tune(problem)
         # The scenario says it, and no economics.

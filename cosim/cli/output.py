@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -103,6 +104,29 @@ class Output:
             # A bar that is being drawn turns standard error to itself.
             print(text, file=sys.stderr)
 
+    def legend(self, text: str) -> None:
+        """Print a line on the table above to where that went, unless JSON was asked for."""
+        if not self.as_json:
+            _print(text)
+
+    def entries(self, title: str, entries: Sequence[tuple[str, str]]) -> None:
+        """Print entries, each a line with its text indented below, unless JSON was asked for.
+
+        Args:
+            title: a line above them.
+            entries: the line and the text of each.
+        """
+        if self.as_json:
+            return
+        from textwrap import fill
+
+        width = shutil.get_terminal_size().columns
+        lines = [title]
+        for heading, text in entries:
+            lines.append(fill(heading, width, initial_indent="  ", subsequent_indent="    "))
+            lines.append(fill(text, width, initial_indent="      ", subsequent_indent="      "))
+        _print("\n".join(lines))
+
     def table(
         self,
         title: str,
@@ -194,6 +218,13 @@ class Output:
         if fmu not in SHIPPED_FMUS:
             unpacked = unpack(fmu)
             self.note(f"native code of {unpacked.path}, sha256 {unpacked.sha256}")
+
+
+def _print(text: str) -> None:
+    """Print text as it is where tables go; a reader that leaves ends the command as theirs does."""
+    from rich.console import Console
+
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _fitting_tables(widths: Sequence[int], room: int) -> list[list[int]]:

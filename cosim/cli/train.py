@@ -154,8 +154,10 @@ def train(
 
 def _explain(algorithm: str, hyperparameters: Sequence[Hyperparameter], output: cli.Output) -> None:
     """Print a rule's hyperparameters."""
-    header = ("name", "default", "allowed", "meaning")
-    output.table(f"hyperparameters of {algorithm}", header, hyperparameters)
+    entries = []
+    for name, default, allowed, meaning in hyperparameters:
+        entries.append((f"{name} = {default}  ({allowed})", meaning))
+    output.entries(f"hyperparameters of {algorithm}: name = default  (allowed)", entries)
     document = {}
     for hyperparameter in hyperparameters:
         words = hyperparameter._asdict()

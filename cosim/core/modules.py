@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import re
@@ -125,14 +126,65 @@ def load_plugin(
             plugin: Any = importlib.import_module(module)
             if foreign:
                 _remember_code(module)
-        for part in attribute.split("."):
-            plugin = getattr(plugin, part)
+    except ModuleNotFoundError as cause:
+        # Of a module that it imports itself the file and the line are told.
+        if cause.name is None or not f"{module}.".startswith(f"{cause.name}."):
+            raise error(f"{what} cannot be imported: {exception_line(cause)}") from cause
+        from cosim.core.validation import suggestion  # noqa: PLC0415 - pydantic
+
+        names = [path.stem for folder in import_folders() for path in Path(folder).glob("*.py")]
+        raise error(
+            f"{what} cannot be imported: there is no module '{cause.name}' in {Path.cwd()}, nor "
+            f"is one installed{suggestion(cause.name, names)}"
+        ) from cause
     # A module may raise anything while it is imported, and one that is a script may even exit.
     except (Exception, SystemExit) as cause:
         raise error(f"{what} cannot be imported: {exception_line(cause)}") from cause
     if foreign:
         _refuse_two_of_one_name(module, what, error)
-    return plugin
+    return _attribute_of(plugin, attribute, what, error)
+
+
+def _attribute_of(
+    module: Any,
+    attribute: str,
+    what: str,
+    error: type[Exception],
+) -> Any:
+    """What a module has under a dotted name; raises `error` with the name that is close."""
+    found = module
+    for part in attribute.split("."):
+        try:
+            found = getattr(found, part)
+        except AttributeError as cause:
+            from cosim.core.validation import suggestion  # noqa: PLC0415 - pydantic
+
+            known = [name for name in dir(found) if not name.startswith("_")]
+            raise error(
+                f"{what} cannot be imported: module '{module.__name__}' has no attribute "
+                f"'{attribute}'{suggestion(part, known)}"
+            ) from cause
+        # A module may compute its attributes, by code that raises anything.
+        except (Exception, SystemExit) as cause:
+            raise error(f"{what} cannot be imported: {exception_line(cause)}") from cause
+    return found
+
+
+def target_in_file(file: str) -> str:
+    """Form `module:Class` of what a Python file has, to be typed in place of the file's name.
+
+    Args:
+        file: the name that was typed, `folder/mine.py` say.
+    """
+    path = Path(file)
+    names = []
+    with suppress(OSError, ValueError, SyntaxError):
+        for statement in ast.parse(path.read_bytes()).body:
+            if isinstance(statement, ast.ClassDef):
+                names.append(statement.name)
+    # Helpers stand before what uses them.
+    name = names[-1] if names else "Class"
+    return f"{path.stem}:{name}"
 
 
 def _remember_code(module: str) -> None:

@@ -90,9 +90,7 @@ class FmuPlant:
         step = plant.communication_step or self._h
         self._steps = round(self._h / step)
         archive = unpack(plant.fmu if fmu is None else fmu)
-        # The first reason suffices: the others may follow from it.
-        for refusal in refusals(archive, step):
-            raise PlantError(refusal)
+        _refuse(scenario, archive, step)
         wiring = Wiring(scenario, archive)
         self._wiring = wiring
         self._seeds = wiring.seeds
@@ -584,3 +582,30 @@ def _units(scenario: Scenario, archive: UnpackedFmu) -> dict[str, str]:
     for name, variable in variables.items():
         units[name] = archive.unit(variable) if variable else ""
     return units
+
+
+def _refuse(scenario: Scenario, archive: UnpackedFmu, step: float) -> None:
+    """Raise PlantError where the FMU cannot be this scenario's plant at this step in s."""
+    # The first reason suffices: the others may follow from it.
+    for refusal in refusals(archive, step):
+        raise PlantError(refusal)
+    refuse_bounds_elsewhere(scenario, archive)
+
+
+def refuse_bounds_elsewhere(scenario: Scenario, archive: UnpackedFmu) -> None:
+    """Refuse bounds that no value of the FMU's variable keeps: they are in another unit.
+
+    Args:
+        scenario: has the bounds.
+        archive: the FMU, which may state the least and the greatest value of a variable.
+
+    Raises:
+        PlantError: names the variable and both ranges.
+    """
+    for name, (lower, upper) in scenario.limits.items():
+        least, greatest = archive.range(name)
+        if lower > greatest or upper < least:
+            raise PlantError(
+                f"scenario '{scenario.name}' bounds {name} to {lower:g} … {upper:g}, and the FMU "
+                f"has it from {least:g} to {greatest:g}: another unit?"
+            )

@@ -169,7 +169,12 @@ class StudyResults(StudyMeasurements, Shown):
             if figure is not None:
                 return figure
             raise StudyError(f"'{name}': the study's tables have nothing to draw in this figure")
-        raise StudyError(f"this study draws no figure '{name}'{instead(name, drawn)}")
+        # Only what can be drawn is offered.
+        offered = []
+        for other, (draw, scenario) in drawn.items():
+            if draw(self, scenario, width) is not None:
+                offered.append(other)
+        raise StudyError(f"this study draws no figure '{name}'{instead(name, offered)}")
 
     def draw(self, folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, list[str]]:
         """Draw the figures of the tables.

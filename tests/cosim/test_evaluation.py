@@ -204,3 +204,31 @@ def test_a_printed_table_has_regret_in_per_cent_and_the_columns_asked_for(paper)
     assert evaluation.table(["controller", "J"]).startswith("| controller | J |")
     with pytest.raises(EvaluationError, match=r"no column 'regre' \(did you mean 'regret'"):
         evaluation.table(["regre"])
+
+
+def test_pairs_have_one_interval_each(capsys):
+    """A quotient's interval may leave out zero where that of the difference has it."""
+    from cosim.cli.evaluate import _show_pairs
+    from cosim.cli.output import Output
+
+    difference = {"value": -28.0, "interval": (-71.0, 14.0)}
+    gain = {"value": 0.5, "interval": (0.39, 0.62), "bootstrap": (0.39, 0.62)}
+    comparison = {
+        "controller": "mine",
+        "reference": "naive",
+        "differences": {"J": difference},
+        "gain_in_J": gain,
+    }
+    _show_pairs({"comparisons": [comparison]}, Output(False))
+    out = capsys.readouterr().out
+    assert "[-71, 14]" in out and "50.0" in out and "39" not in out
+
+
+def test_the_legend_goes_where_its_table_goes(capsys, paper):
+    from cosim.cli.evaluate import show_evaluation
+    from cosim.cli.output import Output
+
+    evaluation = evaluate(paper, BOTH, 2, 20)
+    show_evaluation(evaluation.summary(), Output(False), pairs=False)
+    out, err = capsys.readouterr()
+    assert "regret = (J − J*)/|J*|" in out and not err

@@ -52,6 +52,7 @@ def test_a_fault_of_one_rate_is_found_and_has_its_size():
     assert found.model - found.fmu == pytest.approx(1.0, rel=0.1)
     assert set(found.where) > {"X2", "P2", "P100", "F200", "F1"}
     assert by_name["economic_cost"].difference < 1e-9
+    assert " 1 (" not in str(by_name["economic_cost"])
 
 
 def test_a_fault_of_the_cost_is_found():

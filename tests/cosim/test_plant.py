@@ -1,6 +1,7 @@
 import gc
 import mmap
 from pathlib import Path
+from types import SimpleNamespace
 
 import fmpy
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import fmus
 from cosim import FmuPlant, Scenario
 from cosim.core.errors import PlantError
+from cosim.plant.fmu_plant import refuse_bounds_elsewhere
 
 ACTIONS = np.random.default_rng(7).uniform(100, 400, (50, 2))
 
@@ -269,3 +271,14 @@ def test_who_simulates_by_fmpy_beside_us_does_not_take_our_messages(paper):
     with pytest.raises(PlantError, match="outside"), FmuPlant(longest) as plant:
         plant.reset(0)
     assert len(taken) == count
+
+
+def test_bounds_that_the_fmu_never_meets_are_refused(paper):
+    stated = {"P2": (233.0, 353.0)}
+    in_kelvin = SimpleNamespace(range=lambda name: stated.get(name, (-np.inf, np.inf)))
+    with pytest.raises(
+        PlantError, match="bounds P2 to 40 … 80, and the FMU has it from 233 to 353"
+    ):
+        refuse_bounds_elsewhere(paper, in_kelvin)
+    stated["P2"] = (60.0, 100.0)
+    refuse_bounds_elsewhere(paper, in_kelvin)

@@ -47,6 +47,23 @@ def test_an_algorithm_whose_module_fails_is_named(module):
         load_algorithm(f"{module('raise SystemExit(0)')}:Thing")
 
 
+def test_a_misspelt_class_module_or_file_is_told_its_likely_name(tmp_path, monkeypatch):
+    (tmp_path / "own_search.py").write_text("class Helper: pass\nclass OwnSearch: pass\n")
+    monkeypatch.chdir(tmp_path)
+    for given, hint in (
+        (
+            "own_search:OwnSerch",
+            "no attribute 'OwnSerch' (did you mean 'OwnSearch'?)",
+        ),
+        ("own_serch:OwnSearch", "no module 'own_serch' in"),
+        ("own_serch:OwnSearch", "(did you mean 'own_search'?)"),
+        ("own_search.py", "give its class, own_search:OwnSearch,"),
+    ):
+        with pytest.raises(AlgorithmLookupError) as caught:
+            load_algorithm(given)
+        assert hint in str(caught.value) and "importlib" not in str(caught.value)
+
+
 def test_a_controller_that_fails_in_the_loop_is_told_where(tmp_path):
     (tmp_path / "broken.py").write_text(
         "class Broken:\n"

@@ -26,7 +26,7 @@ def test_what_a_hyperparameter_may_be_is_said_in_words():
     documented = {entry.name: entry.allowed for entry in Dyna.Configuration.documentation()}
     assert documented["rule"] == "kalman, td, fit"
     assert documented["prior_width"] == "number > 0"
-    assert documented["discount"] == "number > 0, ≤ 1 or nothing"
+    assert documented["discount"] == "number > 0, ≤ 1 or unset"
     assert documented["change_windows"] == "4 × integer ≥ 1"
 
 

@@ -68,6 +68,15 @@ def test_explain_lists_every_hyperparameter(cosim):
     assert json.loads(out)["radius"]["meaning"].startswith("trust region")
 
 
+def test_explain_gives_each_meaning_the_width_of_the_terminal(cosim, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = cosim("train", "-a", "model-based", "--explain")
+    lines = out.splitlines()
+    assert code == 0 and max(map(len, lines)) <= 80
+    place = lines.index("  exploration_decay_after = unset  (integer ≥ 1 or unset)")
+    assert lines[place + 1].startswith("      samples T after which the share that explores falls")
+
+
 @pytest.mark.slow
 def test_divergence_ends_with_exit_code_1_and_says_why(cosim, undrawn, tmp_path):
     code, out, _ = cosim(

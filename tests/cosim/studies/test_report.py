@@ -74,6 +74,8 @@ def test_a_study_of_baselines_alone_draws_no_course_of_learning(tmp_path):
     assert found.figure("regret-paper").axes
     with pytest.raises(StudyError):
         found.figure("curves-paper")
+    with pytest.raises(StudyError, match=r"no figure 'regret-papper'.*; there are regret-paper$"):
+        found.figure("regret-papper")
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ TABLES = {
     "an estimator of nothing": ('[estimator]\nkind = "ekf"\n', "there is no [[sensor]]"),
     "an estimator from nowhere": (
         X2 + '[estimator]\nkind = "nowhere:factory"\n',
-        "No module named 'nowhere'",
+        "no module 'nowhere'",
     ),
     "a hot word": (
         SIGNAL + 'file = "text.csv"\nperiod = 600.0\n' + BOUND,
